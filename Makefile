@@ -1,0 +1,101 @@
+# Everything one does with this project; `make help` lists it. Two commands for a newcomer: `make setup`, `make demo`.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+# What to install as PyTorch. For a build from one of PyTorch's own indexes (CPU only, another CUDA) set pip's
+# environment, e.g. PIP_EXTRA_INDEX_URL, and name the build here: make setup TORCH=torch==2.13.0+cpu
+TORCH ?= torch==2.13.0
+# Test processes. Each computes on one thread, so that they share the cores instead of fighting over them.
+WORKERS ?= 2
+SEED ?= 0
+DEMO_DATA ?= datasets/mujoco_block_demo
+DEMO_RUN ?= runs/demo/seed$(SEED)
+STAMP := $(VENV)/.installed
+
+export MPLBACKEND = Agg
+
+.PHONY: help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
+	types imports cluster bench wheel clean
+
+help: ## List the targets
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	echo
+	echo "Variables: PYTHON=$(PYTHON) TORCH=$(TORCH) WORKERS=$(WORKERS) SEED=$(SEED)"
+
+setup: $(STAMP) ## Make .venv and install the project with its tested versions (TORCH=... picks a PyTorch build)
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), f"Python 3.11 to 3.13 is needed, this is {sys.version.split()[0]}: make setup PYTHON=python3.12"'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install -c constraints.txt "$(TORCH)"
+	$(BIN)/python -m pip install -c constraints.txt -e ".[dev]"
+	touch $@
+
+install: ## Install the project into the environment that is active now, without a .venv
+	$(PYTHON) -m pip install -c constraints.txt "$(TORCH)"
+	$(PYTHON) -m pip install -c constraints.txt -e .
+
+demo: setup ## Generate, train, evaluate and film the two-core demo (about 10 minutes); its figures come last
+	$(MAKE) --no-print-directory generate-demo
+	$(MAKE) --no-print-directory train-demo
+	$(MAKE) --no-print-directory video-demo
+	$(MAKE) --no-print-directory eval-demo
+
+generate-demo: $(STAMP) ## Generate the demo's videos with MuJoCo (resumes, or does nothing when they are there)
+	$(BIN)/vpd-data generate scene=mujoco_block preset=demo out=$(DEMO_DATA) seed=0
+
+train-demo: $(STAMP) ## Train the demo (SEED=0); a stopped training goes on where it was
+	$(BIN)/vpd-train experiment=demo seed=$(SEED) data.folder=$(DEMO_DATA) run.folder=$(DEMO_RUN) resume=auto
+
+# Results are never overwritten: a second evaluation or film of the same run gets a folder with the time in its name.
+NEW_FOLDER = $$(test -e $(1) && echo $(1)_$$(date +%Y-%m-%d_%H-%M-%S) || echo $(1))
+
+eval-demo: $(STAMP) ## Evaluate the demo on its test trajectories and print the figures
+	$(BIN)/vpd-eval ckpt=$(DEMO_RUN)/checkpoints/last.ckpt data.folder=$(DEMO_DATA) out=$(call NEW_FOLDER,$(DEMO_RUN)/evaluation)
+
+video-demo: $(STAMP) ## Film a predicted rollout of the demo
+	$(BIN)/vpd-render ckpt=$(DEMO_RUN)/checkpoints/last.ckpt data.folder=$(DEMO_DATA) out=$(call NEW_FOLDER,$(DEMO_RUN)/render)
+
+test: $(STAMP) ## Run all tests (no GPU and no torch-cluster needed; under 10 minutes on two cores)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+test-fast: $(STAMP) ## Run the tests that are not marked slow (under 2 minutes)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"
+
+check: format-check lint types imports test ## Everything that must pass before a change goes in
+
+format: $(STAMP) ## Rewrite the code in the house format
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+format-check: $(STAMP) ## Check the format
+	$(BIN)/ruff format --check .
+
+lint: $(STAMP) ## Check style and docstrings
+	$(BIN)/ruff check .
+
+types: $(STAMP) ## Check the type annotations
+	$(BIN)/mypy
+
+imports: $(STAMP) ## Check that imports point one way (contracts in pyproject.toml)
+	$(BIN)/lint-imports
+
+cluster: $(STAMP) ## Build and install torch-cluster (needs a C++ compiler; 10 to 20 minutes on two cores)
+	$(BIN)/python -m pip install -c constraints.txt setuptools wheel
+	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation torch-cluster==1.6.3
+
+bench: $(STAMP) ## Time one training step and one rendered frame against the plain path; writes benchmarks/results
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_step
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.render_frame
+
+wheel: $(STAMP) ## Build the wheel into dist/
+	$(BIN)/python -m build --wheel
+
+clean: ## Remove caches and build products; runs, data sets and .venv stay
+	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -print0 | xargs -0 rm -rf
