@@ -1,0 +1,117 @@
+"""Building blocks of graph networks: plain MLPs, a factored first edge layer, updaters with layer norm and residual."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+from torch_geometric.utils import segment
+
+
+class MLP(nn.Module):
+    """Linear layers of the given widths with ReLU between them and nothing behind the last.
+
+    ``MLP(3, (128, 128))`` has (3 * 128 + 128) + (128 * 128 + 128) parameters. Weights start as truncated normals of
+    variance 1 / fan-in, biases at zero (Haiku's MLP, which the mesh-based simulators behind the paper use).
+    """
+
+    def __init__(self, input_dim: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        if not widths or min(widths) < 1 or input_dim < 1:
+            raise ValueError(f"An MLP needs widths of at least 1, got {input_dim} -> {list(widths)}.")
+        sizes = [input_dim, *widths]
+        self.layers = nn.ModuleList(nn.Linear(before, after) for before, after in zip(sizes, widths, strict=False))
+        for layer in self.layers:
+            deviation = layer.in_features**-0.5
+            nn.init.trunc_normal_(layer.weight, std=deviation, a=-2 * deviation, b=2 * deviation)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, inputs: Float[Tensor, "*shape input"]) -> Float[Tensor, "*shape output"]:
+        """Apply all layers."""
+        return self.after_first(self.layers[0](inputs))
+
+    def after_first(self, hidden: Float[Tensor, "*shape hidden"]) -> Float[Tensor, "*shape output"]:
+        """Continue behind the first linear layer, which a caller may have computed in parts."""
+        for layer in self.layers[1:]:
+            hidden = layer(functional.relu(hidden))
+        return hidden
+
+
+class FullPrecisionLayerNorm(nn.LayerNorm):
+    """Layer norm in at least float32, also under autocast and also for empty inputs."""
+
+    def forward(self, inputs: Float[Tensor, "*shape feature"]) -> Float[Tensor, "*shape feature"]:
+        """Normalise over the last axis."""
+        with torch.autocast(inputs.device.type, enabled=False):
+            return super().forward(inputs.float() if inputs.dtype in (torch.float16, torch.bfloat16) else inputs)
+
+
+class EdgeUpdater(nn.Module):
+    """``edge <- edge + LayerNorm(MLP(edge, sender, receiver))``; inputs are concatenated in this order.
+
+    The first layer is one weight over the concatenation, but it is applied in parts, ``W_e edge + (W_s senders)[edge's
+    sender] + (W_r receivers)[edge's receiver] + b``: the same sum, with the node parts multiplied once per node and no
+    concatenation written down. ``num_node_inputs`` is 1 where receivers have no features yet.
+    """
+
+    def __init__(self, hidden_dim: int, num_node_inputs: int) -> None:
+        super().__init__()
+        if num_node_inputs not in (1, 2):
+            raise ValueError(f"num_node_inputs must be 1 (senders) or 2 (and receivers), got {num_node_inputs}.")
+        self.num_node_inputs = num_node_inputs
+        self.mlp = MLP((1 + num_node_inputs) * hidden_dim, (hidden_dim, hidden_dim))
+        self.norm = FullPrecisionLayerNorm(hidden_dim)
+
+    def forward(
+        self,
+        edges: Float[Tensor, "edge feature"],
+        sender_nodes: Float[Tensor, "sender_node feature"],
+        receiver_nodes: Float[Tensor, "receiver_node feature"] | None,
+        senders: Int64[Tensor, " edge"],
+        receivers: Int64[Tensor, " edge"],
+    ) -> Float[Tensor, "edge feature"]:
+        """Return the updated edges; ``receiver_nodes`` is ``None`` exactly where ``num_node_inputs`` is 1."""
+        if (receiver_nodes is None) != (self.num_node_inputs == 1):
+            raise ValueError(f"This updater was built for {self.num_node_inputs} node inputs.")
+        first = self.mlp.layers[0]
+        parts = first.weight.split(edges.shape[-1], dim=1)
+        hidden = functional.linear(edges, parts[0], first.bias)
+        hidden = hidden + functional.linear(sender_nodes, parts[1]).index_select(0, senders)
+        if receiver_nodes is not None:
+            hidden = hidden + functional.linear(receiver_nodes, parts[2]).index_select(0, receivers)
+        return edges + self.norm(self.mlp.after_first(hidden))
+
+
+class NodeUpdater(nn.Module):
+    """``node <- node + LayerNorm(MLP(node, sum of incoming edges))``; inputs are concatenated in this order.
+
+    With ``has_nodes`` false the nodes have no features yet: they are not concatenated, and there is no residual.
+    """
+
+    def __init__(self, hidden_dim: int, has_nodes: bool) -> None:
+        super().__init__()
+        self.has_nodes = has_nodes
+        self.mlp = MLP((2 if has_nodes else 1) * hidden_dim, (hidden_dim, hidden_dim))
+        self.norm = FullPrecisionLayerNorm(hidden_dim)
+
+    def forward(
+        self, nodes: Float[Tensor, "node feature"] | None, messages: Float[Tensor, "node feature"]
+    ) -> Float[Tensor, "node feature"]:
+        """Return the updated nodes; ``nodes`` is ``None`` exactly where ``has_nodes`` is false."""
+        if (nodes is None) == self.has_nodes:
+            raise ValueError(f"This updater was built for nodes {'with' if self.has_nodes else 'without'} features.")
+        if nodes is None:
+            return self.norm(self.mlp(messages))
+        return nodes + self.norm(self.mlp(torch.cat([nodes, messages], dim=-1)))
+
+
+def summed_at_receivers(
+    edges: Float[Tensor, "edge feature"], receiver_offsets: Int64[Tensor, " node_plus_one"]
+) -> Float[Tensor, "node feature"]:
+    """Sum the edges of each receiver; edges are sorted by receiver, node i owns ``offsets[i]`` to ``offsets[i + 1]``.
+
+    Segment sums add in the order of the edges, so they repeat bit for bit on every device, unlike atomic scatters.
+    """
+    with torch.autocast(edges.device.type, enabled=False):
+        return segment(edges, receiver_offsets, reduce="sum")

@@ -1,0 +1,207 @@
+"""Rigid motions of weighted point sets: closed-form fits, applied and estimated without correspondences."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Twists:
+    """Motion of each anchor over one step: its centre, displacement (metres) and ``spin`` = 2 tan(angle / 2) * axis."""
+
+    centers: Float[Tensor, "*batch anchor 3"]
+    displacements: Float[Tensor, "*batch anchor 3"]
+    spins: Float[Tensor, "*batch anchor 3"]
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Return the vector product over the last axis, with broadcasting."""
+    a, b = torch.broadcast_tensors(a, b)
+    return torch.linalg.cross(a, b)
+
+
+def weighted_sum(weights: Float[Tensor, "*batch anchor particle"], values: Tensor) -> Tensor:
+    """Sum values (``... particle c``) over particles with the weights of each anchor, in full precision."""
+    return (weights[..., None] * values[..., None, :, :]).sum(dim=-2)
+
+
+def fit_twists(
+    positions: Float[Tensor, "batch particle 3"],
+    displacements: Float[Tensor, "batch particle 3"],
+    weights: Float[Tensor, "batch anchor particle"],
+) -> Twists:
+    """Fit a rigid motion to the last displacement of each anchor's particles by weighted least squares.
+
+    Offsets are taken at the midpoints of the motion, where the Cayley form is exact for rigid motion: no SVD, smooth
+    gradients. ``weights`` sum to one over particles. ``positions`` are those after the displacement.
+    """
+    center = weighted_sum(weights, positions)
+    mean = weighted_sum(weights, displacements)
+    middle = (positions - displacements / 2)[:, None] - (center - mean / 2)[:, :, None]
+    momentum = (weights[..., None] * cross(middle, displacements[:, None] - mean[:, :, None])).sum(dim=2)
+    spins = torch.linalg.solve(_inertia(middle, weights), momentum)
+    return Twists(center, mean, spins)
+
+
+def invert_inertia(
+    positions: Float[Tensor, "batch particle 3"],
+    centers: Float[Tensor, "batch anchor 3"],
+    weights: Float[Tensor, "batch anchor particle"],
+) -> Float[Tensor, "batch anchor 3 3"]:
+    """Return the inverse inertia about the centres of unit masses spread over the particles by ``weights``."""
+    return torch.linalg.inv(_inertia(positions[:, None] - centers[:, :, None], weights))
+
+
+def equidistant_centers(
+    positions: Float[Tensor, "batch particle 3"],
+    normals: Float[Tensor, "batch particle 3"],
+    weights: Float[Tensor, "batch anchor particle"],
+) -> Float[Tensor, "batch anchor 3"]:
+    """Find the point at equal distance from all tangent planes: the centre of a ball or cube of which a part is seen.
+
+    Least squares of n . (x - c) = h over (c, h). Where the seen surface leaves a direction open (one face), a weak
+    pull towards the particles' mean decides. The mean itself would be off by what is hidden, and a spinning body
+    would be carried around the wrong point.
+    """
+    known = weights * (normals.square().sum(dim=-1) > 0.5)[:, None]
+    known = known / known.sum(dim=-1, keepdim=True).clamp(min=1e-12)
+    mean = weighted_sum(weights, positions)
+    rows = torch.cat([normals, torch.ones_like(normals[..., :1])], dim=-1)
+    heights = (normals[:, None] * (positions[:, None] - mean[:, :, None])).sum(dim=-1)
+    matrix = torch.einsum("bap,bpi,bpj->baij", known, rows, rows)
+    right = torch.einsum("bap,bpi,bap->bai", known, rows, heights)
+    pull = torch.diag(positions.new_tensor([0.01, 0.01, 0.01, 1e-4]))
+    offset = torch.linalg.solve(matrix + pull, right)[..., :3]
+    reach = weighted_sum(weights, positions.square()).sum(-1) - mean.square().sum(-1)
+    limit = reach.clamp(min=1e-12).sqrt()[..., None]  # never farther than the particles themselves reach
+    length = offset.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+    return mean + offset * (limit / length).clamp(max=1)
+
+
+def _inertia(offsets: Tensor, weights: Tensor) -> Tensor:
+    square = (weights * offsets.square().sum(dim=-1)).sum(dim=-1)
+    outer = (weights[..., None, None] * offsets[..., :, None] * offsets[..., None, :]).sum(dim=-3)
+    eye = torch.eye(3, dtype=offsets.dtype, device=offsets.device)
+    # The ridge keeps a flat or single-point anchor solvable; it is small against any body of more than a centimetre.
+    return square[..., None, None] * eye - outer + 1e-6 * eye
+
+
+def rotation_from_spin(spins: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the rotation of a spin vector 2 tan(angle / 2) * axis (Cayley transform): orthonormal for any input."""
+    half = spins / 2
+    x, y, z = half.unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=spins.dtype, device=spins.device)
+    square = half.square().sum(dim=-1)[..., None, None]
+    outer = half[..., :, None] * half[..., None, :]
+    return ((1 - square) * eye + 2 * outer + 2 * skew) / (1 + square)
+
+
+def rotate(rotation: Float[Tensor, "*#batch 3 3"], vectors: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "... 3"]:
+    """Rotate vectors by explicit sums, so that autocast cannot lower their precision."""
+    return (rotation * vectors[..., None, :]).sum(dim=-1)
+
+
+def farthest_points(
+    positions: Float[Tensor, "batch particle 3"], mask: Bool[Tensor, "batch particle"], count: int
+) -> Float[Tensor, "batch anchor 3"]:
+    """Choose well-spread anchors among the valid particles, the first nearest to their mean; repeats when too few."""
+    total = mask.sum(dim=1, keepdim=True).clamp(min=1)
+    mean = (positions * mask[..., None]).sum(dim=1) / total
+    gap = (positions - mean[:, None]).square().sum(dim=-1).masked_fill(~mask, float("inf"))
+    index = gap.argmin(dim=1)
+    batch = torch.arange(len(positions), device=positions.device)
+    chosen = [positions[batch, index]]
+    nearest = torch.full_like(gap, float("inf"))
+    for _ in range(count - 1):
+        nearest = torch.minimum(nearest, (positions - chosen[-1][:, None]).square().sum(dim=-1))
+        index = nearest.masked_fill(~mask, -1.0).argmax(dim=1)
+        chosen.append(positions[batch, index])
+    return torch.stack(chosen, dim=1)
+
+
+def anchor_weights(
+    anchors: Float[Tensor, "batch anchor 3"],
+    positions: Float[Tensor, "batch particle 3"],
+    mask: Bool[Tensor, "batch particle"],
+    radius: float,
+) -> Float[Tensor, "batch anchor particle"]:
+    """Gaussian affinity of particles to anchors; zero for padding. Not normalised."""
+    square = (anchors[:, :, None] - positions[:, None]).square().sum(dim=-1)
+    # The floor keeps a particle that is far from every anchor attached to all of them instead of to none.
+    return (torch.exp(-square / (2 * radius**2)) + 1e-6) * mask[:, None]
+
+
+@torch.no_grad()
+def match_locally_rigid(
+    positions: Float[Tensor, "batch particle 3"],
+    colors: Float[Tensor, "batch particle 3"],
+    mask: Bool[Tensor, "batch particle"],
+    target_positions: Float[Tensor, "batch target 3"],
+    target_colors: Float[Tensor, "batch target 3"],
+    target_mask: Bool[Tensor, "batch target"],
+    *,
+    num_anchors: int,
+    radius: float,
+    match_scales: Sequence[float],
+    color_scale: float,
+) -> Float[Tensor, "batch particle 3"]:
+    """Find where each particle was in the target frame, without correspondences (metres).
+
+    Soft matches in space and colour, annealed from ``match_scales[0]`` to the last (metres); after each round a
+    weighted rigid fit (Kabsch) per anchor replaces the matches by their locally rigid consensus. Single matches fail
+    on faces of one colour (the aperture problem); agreement on a rotation resolves them. Colours are compared as
+    chromaticity and, more weakly, brightness, so that shading under rotation does not break a match.
+    """
+    features, target_features = _chromaticity(colors), _chromaticity(target_colors)
+    color_cost = (features[:, :, None] - target_features[:, None]).square().sum(dim=-1) / (2 * color_scale**2)
+    color_cost = color_cost.masked_fill(~target_mask[:, None], float("inf"))
+    anchors = farthest_points(positions, mask, num_anchors)
+    affinity = anchor_weights(anchors, positions, mask, radius)
+    share = affinity / affinity.sum(dim=1, keepdim=True).clamp(min=1e-12)
+    moved = positions + (_masked_mean(target_positions, target_mask) - _masked_mean(positions, mask))[:, None]
+    origin = _masked_mean(target_positions, target_mask)[:, None]
+    goal_square = (target_positions - origin).square().sum(dim=-1)[:, None]
+    for scale in match_scales:
+        # The product form of the squared distance keeps its digits here: both sets are centred on a body's size.
+        local = moved - origin
+        square = local.square().sum(dim=-1)[..., None] + goal_square - 2 * local @ (target_positions - origin).mT
+        logits = -square / (2 * scale**2) - color_cost
+        top = logits.amax(dim=-1, keepdim=True).clamp(min=-80.0)
+        kernel = torch.exp(logits - top)
+        total = kernel.sum(dim=-1, keepdim=True).clamp(min=1e-12)
+        matches = (kernel @ target_positions) / total
+        evidence = (total * torch.exp(top)).squeeze(-1)
+        weights = affinity * (evidence / (evidence + 0.3))[:, None]
+        rotation, center, goal = _kabsch(positions, matches, weights)
+        candidates = rotate(rotation[:, :, None], positions[:, None] - center[:, :, None]) + goal[:, :, None]
+        moved = (share[..., None] * candidates).sum(dim=1)
+    return torch.where(mask[..., None], moved, positions)
+
+
+def _chromaticity(colors: Tensor) -> Tensor:
+    return torch.cat([colors / (colors.sum(dim=-1, keepdim=True) + 0.15), 0.3 * colors], dim=-1)
+
+
+def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    return (values * mask[..., None]).sum(dim=1) / mask.sum(dim=1, keepdim=True).clamp(min=1)
+
+
+def _kabsch(source: Tensor, goal: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit rotation and centres of source -> goal for each anchor (Kabsch 1976), in float64 for the SVD."""
+    weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-12)
+    source_center, goal_center = weighted_sum(weights, source), weighted_sum(weights, goal)
+    a = source[:, None] - source_center[:, :, None]
+    b = goal[:, None] - goal_center[:, :, None]
+    covariance = torch.einsum("kap,kapi,kapj->kaij", weights, b, a).double()
+    eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+    u, _, vt = torch.linalg.svd(covariance + 1e-7 * eye)
+    flip = torch.ones_like(u[..., 0])
+    flip[..., 2] = torch.sign(torch.linalg.det(u @ vt))
+    rotation = (u * flip[..., None, :]) @ vt
+    return rotation.to(source.dtype), source_center, goal_center
+

@@ -1,0 +1,28 @@
+"""The contract of stage 2: the RGB-D frames of one time step in, latent particles out."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+from torch import Tensor, nn
+
+from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.types import Particles, RGBDFrames
+
+
+@dataclass(frozen=True)
+class EncoderOutput:
+    """Particles, and what an encoder offers beside them (for example predicted depth)."""
+
+    particles: Particles
+    auxiliary: dict[str, Tensor] = field(default_factory=dict)
+
+
+class AbstractEncoder(nn.Module, ABC):
+    """Turns the RGB-D frames of one time step (axes ``batch view``) into particles."""
+
+    # A default here would hide the submodule: class attributes win over nn.Module's registry.
+    background: nn.Module | None
+
+    @abstractmethod
+    def forward(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> EncoderOutput:
+        """Encode; ``purpose`` separates the draws of the two context frames."""

@@ -1,0 +1,37 @@
+"""Surface normals from a depth image."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vpd_lightning.geometry.cameras import unproject
+from vpd_lightning.types import Cameras
+
+
+def depth_normals(
+    depth: Float[Tensor, "*shape height width"], cameras: Cameras
+) -> Float[Tensor, "*shape height width 3"]:
+    """Return unit normals towards the camera; zero where they cannot be told (image border, missing depth).
+
+    Each image axis uses whichever one-sided difference crosses the smaller depth step, so that a normal beside an
+    occlusion edge belongs to its own surface.
+    """
+    points = unproject(torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0), cameras)
+    valid = torch.isfinite(depth) & (depth > 0)
+
+    def tangent(axis: int) -> Tensor:
+        forward = torch.roll(points, -1, axis - 1) - points  # axis counts without the trailing coordinate axis
+        backward = points - torch.roll(points, 1, axis - 1)
+        forward_step = (torch.roll(depth, -1, axis) - depth).abs()
+        backward_step = (torch.roll(depth, 1, axis) - depth).abs()
+        return torch.where((forward_step <= backward_step)[..., None], forward, backward)
+
+    normals = torch.linalg.cross(tangent(-2), tangent(-1))
+    length = normals.norm(dim=-1, keepdim=True)
+    normals = normals / length.clamp(min=1e-12)
+    center = cameras.cam_to_world[..., :3, 3][..., None, None, :]
+    towards = ((center - points) * normals).sum(dim=-1, keepdim=True)
+    normals = torch.where(towards < 0, -normals, normals)
+    inner = torch.zeros_like(valid)
+    inner[..., 1:-1, 1:-1] = True
+    return normals * (valid & inner)[..., None]

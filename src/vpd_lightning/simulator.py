@@ -1,0 +1,162 @@
+"""The method on one screen: encode two frames, roll out, render. No Lightning, no Hydra."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from vpd_lightning.dynamics.base import AbstractDynamics
+from vpd_lightning.encoder.base import AbstractEncoder
+from vpd_lightning.geometry.cameras import pixel_rays
+from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.renderer.base import AbstractRenderer
+from vpd_lightning.types import Cameras, Particles, Rays, RenderedRays, RGBDFrames, SimulatorOutput, VideoBatch
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Two encoded frames of one scene (batch axis of 1): all that a rollout needs."""
+
+    previous: Particles
+    current: Particles
+
+
+class Simulator(nn.Module):
+    """Visual Particle Dynamics (paper section 3): encoder, dynamics and renderer, trained end to end from pixels.
+
+    ``location_noise`` is the standard deviation (metres) of the noise on particle positions during training rollouts.
+    ``checkpoint_dynamics`` recomputes each dynamics step in the backward pass: exact gradients, less memory.
+    """
+
+    def __init__(
+        self,
+        *,
+        encoder: AbstractEncoder,
+        dynamics: AbstractDynamics,
+        renderer: AbstractRenderer,
+        location_noise: float,
+        checkpoint_dynamics: bool,
+    ):
+        super().__init__()
+        if location_noise < 0:
+            raise ValueError(f"location_noise must not be negative, got {location_noise}")
+        self.encoder, self.dynamics, self.renderer = encoder, dynamics, renderer
+        self.location_noise, self.checkpoint_dynamics = location_noise, checkpoint_dynamics
+
+    def forward(self, batch: VideoBatch) -> SimulatorOutput:
+        """Predict the rays of every step of the batch; all steps are rendered in one call."""
+        previous = self.encoder(batch.context[:, 0], batch.keys, "previous")
+        current = self.encoder(batch.context[:, 1], batch.keys, "current")
+        num_steps = batch.rays.origins.shape[1]
+        states = self.unroll(previous.particles, current.particles, num_steps, batch.keys)
+        rendered = self._render_steps(states, batch.rays, batch.keys if self.training else None)
+        return SimulatorOutput(rendered, states, current.auxiliary)
+
+    def unroll(self, previous: Particles, current: Particles, num_steps: int, keys: RandomKeys) -> list[Particles]:
+        """Apply the dynamics ``num_steps`` times; returns the predicted states, the first one a step after current."""
+        memory = self.dynamics.initialize(previous, current, keys)
+        states = []
+        for rollout_step in range(num_steps):
+            noisy = self._add_location_noise(current, keys, rollout_step)
+            arguments = (previous, noisy, memory, keys, rollout_step)
+            if self.checkpoint_dynamics and torch.is_grad_enabled():
+                following, memory = checkpoint(self.dynamics, *arguments, use_reentrant=False, preserve_rng_state=False)
+            else:
+                following, memory = self.dynamics(*arguments)
+            previous, current = noisy, following
+            states.append(following)
+        return states
+
+    def _add_location_noise(self, particles: Particles, keys: RandomKeys, rollout_step: int) -> Particles:
+        if not self.training or self.location_noise == 0:
+            return particles
+        shape = particles.positions.shape[1:]
+        noise = torch.stack([torch.randn(shape, generator=g) for g in keys.generators(f"noise/{rollout_step}")])
+        return replace(particles, positions=particles.positions + self.location_noise * noise.to(particles.positions))
+
+    def _render_steps(self, states: Sequence[Particles], rays: Rays, keys: RandomKeys | None) -> RenderedRays:
+        """Render ``batch time ray`` rays of a list of states as one batch of ``batch * time`` scenes."""
+        batch_size, num_steps = rays.origins.shape[:2]
+
+        def flatten(tensors: Sequence[Tensor]) -> Tensor:
+            return torch.stack(list(tensors), dim=1).flatten(0, 1)
+
+        particles = Particles(
+            positions=flatten([s.positions for s in states]),
+            features=flatten([s.features for s in states]),
+            mask=flatten([s.mask for s in states]),
+        )
+        flat_rays = Rays(rays.origins.flatten(0, 1), rays.directions.flatten(0, 1))
+        if keys is not None:  # one set of draws per (member, step); steps stay apart for up to a million steps
+            index = [member * 1_000_000 + t for member in keys.sample_index for t in range(num_steps)]
+            keys = replace(keys, sample_index=index)
+        rendered = self.renderer(particles, flat_rays, keys)
+
+        def restore(tensor: Tensor | None) -> Tensor | None:
+            return None if tensor is None else tensor.unflatten(0, (batch_size, num_steps))
+
+        return RenderedRays(
+            rgbs=restore(rendered.rgbs),  # type: ignore[arg-type]
+            depths=restore(rendered.depths),  # type: ignore[arg-type]
+            opacities=restore(rendered.opacities),  # type: ignore[arg-type]
+            coarse_rgbs=restore(rendered.coarse_rgbs),
+        )
+
+    # The Python face for people who have a trained model.
+
+    @torch.inference_mode()
+    def encode(self, rgb: Tensor, depth: Tensor, cameras: Cameras, keys: RandomKeys | None = None) -> Scene:
+        """Encode two frames: ``rgb`` (2, view, height, width, 3) uint8 or [0, 1], ``depth`` in metres.
+
+        ``cameras`` has axes ``view`` or ``2 view``. The draws (particle subsample) are the same every time, unless
+        ``keys`` (for a batch of one) says otherwise.
+        """
+        self.eval()
+        if rgb.shape[:1] != (2,) or rgb.shape[:-1] != depth.shape:
+            raise ValueError(
+                f"rgb must be (2, view, height, width, 3) and depth (2, view, height, width); "
+                f"got {tuple(rgb.shape)} and {tuple(depth.shape)}"
+            )
+        parameter = next(self.parameters())
+        keys = keys or RandomKeys.fixed(1)
+        depth = depth.to(parameter)
+        rgb = (rgb if rgb.is_floating_point() else rgb.to(parameter.dtype) / 255).to(parameter)
+        cameras = cameras.to(parameter.device, parameter.dtype)
+        states = []
+        for time, purpose in enumerate(("previous", "current")):
+            here = cameras[time] if len(cameras.shape) == 2 else cameras
+            frames = RGBDFrames(rgb[time][None], depth[time][None], here[None])
+            states.append(self.encoder(frames, keys, purpose).particles)
+        return Scene(*states)
+
+    @torch.inference_mode()
+    def rollout(self, scene: Scene, num_steps: int, keys: RandomKeys | None = None) -> list[Particles]:
+        """Return the predicted particles of the next ``num_steps`` steps (batch axis of 1)."""
+        self.eval()
+        return self.unroll(scene.previous, scene.current, num_steps, keys or RandomKeys.fixed(1))
+
+    @torch.inference_mode()
+    def render(self, states: Sequence[Particles], cameras: Cameras) -> Float[Tensor, "time view height width 3"]:
+        """Render full images of the states from the cameras (axis ``view``); colours in [0, 1]."""
+        return self.render_maps(states, cameras).rgbs.clamp(0, 1)
+
+    @torch.inference_mode()
+    def render_maps(self, states: Sequence[Particles], cameras: Cameras) -> RenderedRays:
+        """Render colour, expected distance along the ray and opacity, axes ``time view height width``.
+
+        One state at a time, so that memory does not grow with the length of the rollout.
+        """
+        self.eval()
+        parameter = next(self.parameters())
+        rays = pixel_rays(cameras.to(parameter.device, parameter.dtype))
+        flat = Rays(rays.origins.flatten(0, -2)[None], rays.directions.flatten(0, -2)[None])
+        images = [self.renderer(state, flat, None) for state in states]
+        shape = rays.origins.shape[:-1]
+        return RenderedRays(
+            rgbs=torch.stack([image.rgbs[0].reshape(*shape, 3) for image in images]),
+            depths=torch.stack([image.depths[0].reshape(shape) for image in images]),
+            opacities=torch.stack([image.opacities[0].reshape(shape) for image in images]),
+        )

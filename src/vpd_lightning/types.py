@@ -1,0 +1,147 @@
+"""What crosses a stage border: cameras, RGB-D frames, particles, rays, rendered rays and training batches."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from vpd_lightning.randomness import RandomKeys
+
+Border = TypeVar("Border", bound="_Border")
+
+
+def _moved(value: Any, *args: Any, **kwargs: Any) -> Any:
+    """Move tensors and border dataclasses; leave plain values alone. A dtype touches floating tensors only."""
+    return value.to(*args, **kwargs) if isinstance(value, (Tensor, _Border)) else value
+
+
+class _Border:
+    """Mixin of the frozen dataclasses below: ``.to(device)`` or ``.to(dtype)``, field by field."""
+
+    def to(self: Border, *args: Any, **kwargs: Any) -> Border:
+        moved = {}
+        for item in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, item.name)
+            if isinstance(value, Tensor) and not value.is_floating_point():
+                device_args = [a for a in args if not isinstance(a, torch.dtype)]
+                device_kwargs = {k: v for k, v in kwargs.items() if k != "dtype"}
+                moved[item.name] = value.to(*device_args, **device_kwargs) if device_args or device_kwargs else value
+            else:
+                moved[item.name] = _moved(value, *args, **kwargs)
+        return replace(self, **moved)  # type: ignore[type-var]
+
+
+@dataclass(frozen=True)
+class Cameras(_Border):
+    """Pinhole cameras, OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+
+    ``intrinsics`` are in pixels; ``cam_to_world`` maps camera to world coordinates in metres.
+    """
+
+    intrinsics: Float[Tensor, "*shape 3 3"]
+    cam_to_world: Float[Tensor, "*shape 4 4"]
+    height: int
+    width: int
+
+    def __getitem__(self, index: Any) -> "Cameras":
+        return Cameras(self.intrinsics[index], self.cam_to_world[index], self.height, self.width)
+
+    @property
+    def shape(self) -> torch.Size:
+        """Leading axes (for example ``batch view``)."""
+        return self.intrinsics.shape[:-2]
+
+
+@dataclass(frozen=True)
+class RGBDFrames(_Border):
+    """RGB-D images of one or more time steps; ``rgb`` is uint8, or float in [0, 1].
+
+    ``depth`` is z-depth in metres, 0 or non-finite where there is no measurement. ``moving`` marks pixels that may
+    belong to something that moves, where a background model is at hand.
+    """
+
+    rgb: Float[Tensor, "*shape height width 3"] | UInt8[Tensor, "*shape height width 3"]
+    depth: Float[Tensor, "*shape height width"]
+    cameras: Cameras
+    moving: Bool[Tensor, "*shape height width"] | None = None
+
+    def __getitem__(self, index: Any) -> "RGBDFrames":
+        moving = None if self.moving is None else self.moving[index]
+        return RGBDFrames(self.rgb[index], self.depth[index], self.cameras[index], moving)
+
+
+@dataclass(frozen=True)
+class Particles(_Border):
+    """Latent particles, dense and padded; ``mask`` is false for padding. The batch axis may be absent.
+
+    ``colors`` (observed RGB in [0, 1]), ``moving`` (may belong to something that moves) and ``normals`` (unit, zero
+    where unknown) are observations carried along for a dynamics that uses them; the paper's does not.
+    """
+
+    positions: Float[Tensor, "*batch particle 3"]
+    features: Float[Tensor, "*batch particle feature"]
+    mask: Bool[Tensor, "*batch particle"] = None  # type: ignore[assignment]
+    colors: Float[Tensor, "*batch particle 3"] | None = None
+    moving: Bool[Tensor, "*batch particle"] | None = None
+    normals: Float[Tensor, "*batch particle 3"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.mask is None:
+            valid = torch.ones(self.positions.shape[:-1], dtype=torch.bool, device=self.positions.device)
+            object.__setattr__(self, "mask", valid)
+
+    @property
+    def num_particles(self) -> int:
+        return self.positions.shape[-2]
+
+
+@dataclass(frozen=True)
+class Rays(_Border):
+    """Rays in the world frame; ``directions`` have unit length, so that ``t`` along them is a distance in metres."""
+
+    origins: Float[Tensor, "*shape 3"]
+    directions: Float[Tensor, "*shape 3"]
+
+
+@dataclass(frozen=True)
+class RenderedRays(_Border):
+    """What a renderer says of each ray: colour in [0, 1], expected distance along the ray (metres), opacity in [0, 1].
+
+    ``coarse_rgbs`` is the coarse tier's colour where a renderer has one and it is supervised.
+    """
+
+    rgbs: Float[Tensor, "*shape 3"]
+    depths: Float[Tensor, "*shape"]
+    opacities: Float[Tensor, "*shape"]
+    coarse_rgbs: Float[Tensor, "*shape 3"] | None = None
+
+
+@dataclass(frozen=True)
+class VideoBatch(_Border):
+    """One training batch: two context frames and the rays to predict.
+
+    ``context`` has axes ``batch time=2 view ...``; ``rays`` and ``rgbs`` have axes ``batch time ray 3``, where time
+    counts predicted steps. ``clips`` names each member (``file@start``) for messages.
+    """
+
+    context: RGBDFrames
+    rays: Rays
+    rgbs: Float[Tensor, "batch time ray 3"]
+    keys: RandomKeys
+    clips: Sequence[str] = field(default=())
+
+
+@dataclass(frozen=True)
+class SimulatorOutput(_Border):
+    """What one forward pass of the simulator gives to the losses.
+
+    ``rendered`` has axes ``batch time ray``; ``states`` are the predicted particles, one per step; ``auxiliary`` holds
+    what an encoder offers beside particles (for example predicted depth).
+    """
+
+    rendered: RenderedRays
+    states: Sequence[Particles]
+    auxiliary: dict[str, Tensor] = field(default_factory=dict)

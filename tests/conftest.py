@@ -1,0 +1,50 @@
+"""What every test may rely on: a fixed seed, one thread per process, markers that skip what the machine lacks."""
+
+import importlib.util
+import os
+import random
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+# Tests run in several processes; more threads than cores makes all of them slower. Set before OpenCV or HDF5 load.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+torch.set_num_threads(1)
+
+
+def _gl_works() -> bool:
+    if importlib.util.find_spec("data_gen.gl_backend") is None:
+        return False
+    from data_gen.gl_backend import working_backend
+
+    return working_backend() is not None
+
+
+# marker -> (is it there?, what to say when it is not)
+REQUIREMENTS: dict[str, tuple[Callable[[], bool], str]] = {
+    "gpu": (lambda: torch.cuda.is_available(), "needs a CUDA device"),
+    "cluster": (lambda: importlib.util.find_spec("torch_cluster") is not None, "needs torch-cluster: make cluster"),
+    "gl": (_gl_works, "needs EGL or OSMesa"),
+}
+
+
+@pytest.fixture(autouse=True)
+def _requirements(request: pytest.FixtureRequest) -> None:
+    for marker, (is_there, reason) in REQUIREMENTS.items():
+        if request.node.get_closest_marker(marker) and not is_there():
+            pytest.skip(reason)
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    random.seed(0)
+    np.random.seed(0)
+    torch.manual_seed(0)
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """Every device that this machine has, one after the other."""
+    return torch.device(request.param)

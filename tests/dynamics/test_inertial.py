@@ -1,0 +1,211 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.dynamics.test_rigid_motion import cube, random_toss
+from vpd_lightning.dynamics.inertial import InertialDynamics
+from vpd_lightning.dynamics.rigid_motion import rotation_from_spin
+from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.types import Particles
+
+SETTINGS = {
+    "feature_dim": 4,
+    "hidden_dim": 16,
+    "num_anchors": 3,
+    "anchor_radius": 0.5,
+    "body_radius": 2.0,
+    "num_probes": 32,
+    "message_passing_steps": 2,
+    "num_forces": 2,
+    "location_scale": 0.3,
+    "contact_range": 0.5,
+    "match_scales": [0.12, 0.07, 0.04, 0.025, 0.015],
+    "match_color_scale": 0.05,
+    "match_radius": 0.3,
+    "num_matched": 120,
+    "shadow_scales": [0.1, 0.4],
+}
+
+
+def dynamics(**changes):
+    return InertialDynamics(**{**SETTINGS, **changes}).double()
+
+
+def floor(count, seed=9):
+    generator = torch.Generator().manual_seed(seed)
+    positions = torch.rand(count, 3, generator=generator, dtype=torch.float64) * 2 - 1
+    positions[:, 2] = 0
+    return positions
+
+
+def scene(body, body_colors, body_normals, height=0.8, num_floor=50):
+    """A body above a floor; the floor is no candidate for motion."""
+    ground = floor(num_floor)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    positions = torch.cat([body + height * up, ground])
+    generator = torch.Generator().manual_seed(0)
+    return Particles(
+        positions=positions[None],
+        features=torch.rand(1, len(positions), 4, generator=generator, dtype=torch.float64),
+        colors=torch.cat([body_colors, torch.full_like(ground, 0.7)])[None],
+        moving=(torch.arange(len(positions)) < len(body))[None],
+        normals=torch.cat([body_normals, up.expand(num_floor, 3)])[None],
+    )
+
+
+def tossed(seed=0):
+    previous, previous_colors, current, colors, _ = random_toss(seed)
+    normals = cube(200, seed=30 + seed)[2]
+    return (
+        scene(previous, previous_colors, torch.zeros_like(previous)),
+        scene(current, colors, normals),
+    )
+
+
+def roll(model, previous, current, num_steps):
+    keys = RandomKeys.fixed(len(current.positions))
+    memory, states = model.initialize(previous, current, keys), []
+    for step in range(num_steps):
+        following, memory = model(previous, current, memory, keys, step)
+        previous, current = current, following
+        states.append(following)
+    return states
+
+
+def test_untrained_it_continues_the_motion_and_keeps_the_body_rigid():
+    previous, current = tossed()
+    states = roll(dynamics(), previous, current, 6)
+
+    body = current.moving[0]
+    start = torch.cdist(current.positions[0, body], current.positions[0, body])
+    for state in states:
+        assert torch.allclose(torch.cdist(state.positions[0, body], state.positions[0, body]), start, atol=1e-3)
+    centers = torch.stack([state.positions[0, body].mean(0) for state in states])
+    assert (centers[1:] - centers[:-1]).norm(dim=-1).min() > 0.005
+
+
+def test_a_free_spinning_cube_is_followed_around_its_true_centre():
+    points, colors, normals = cube(200, seed=4)
+    spin = torch.tensor([0.2, -0.1, 0.25], dtype=torch.float64)
+    turn, shift = rotation_from_spin(spin), torch.tensor([0.03, 0.0, -0.02], dtype=torch.float64)
+    model = dynamics(num_matched=200)
+    previous = scene(points, colors, normals)
+    current = scene(points @ turn.T + shift, colors, normals @ turn.T)
+    keys = RandomKeys.fixed(1)
+    memory = model.initialize(previous, current, keys)
+    true_displacement = (points @ turn.T + shift) - points
+    memory = replace(memory, displacements=true_displacement[memory.index], center_displacements=shift.expand(1, 3, 3))
+
+    errors = []
+    for step in range(8):
+        current, memory = model(previous, current, memory, keys, step)
+        power = torch.linalg.matrix_power(turn, step + 2)
+        true = points @ power.T + (step + 2) * shift
+        true[:, 2] += 0.8
+        errors.append((current.positions[0, :200] - true).norm(dim=-1).mean())
+
+    assert errors[-1] < 0.012  # of a body 30 cm wide that turned by 150 degrees
+
+
+def test_what_is_no_candidate_stays_exactly_where_it_is():
+    previous, current = tossed()
+    model = dynamics()
+    torch.nn.init.normal_(model.forces.force.weight)
+
+    states = roll(model, previous, current, 20)
+
+    still = ~current.moving[0]
+    assert torch.equal(states[-1].positions[0, still], current.positions[0, still])
+    assert torch.isfinite(states[-1].positions).all()
+
+
+def test_a_body_at_rest_without_forces_stays_at_rest():
+    points, colors, normals = cube(150, seed=2)
+    still = scene(points, colors, normals, height=0.15)
+
+    states = roll(dynamics(), still, still, 5)
+
+    assert (states[-1].positions - still.positions).norm(dim=-1).max() < 0.01
+    # shading follows the turn of a surface: hardly any turn, hardly any change
+    assert (states[-1].features - still.features).abs().max() < 0.05
+
+
+def test_moving_the_world_moves_the_prediction():
+    previous, current = tossed()
+    model = dynamics()
+    torch.nn.init.normal_(model.forces.force.weight, std=0.1)
+    shift = torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
+
+    states = roll(model, previous, current, 3)
+    moved = roll(
+        model,
+        replace(previous, positions=previous.positions + shift),
+        replace(current, positions=current.positions + shift),
+        3,
+    )
+
+    assert torch.allclose(moved[-1].positions, states[-1].positions + shift, atol=1e-6)
+    assert torch.allclose(moved[-1].features, states[-1].features, atol=1e-6)
+
+
+def test_a_batch_equals_its_members_whatever_their_padding():
+    pairs = [tossed(0), tossed(1)]
+    model = dynamics()
+    torch.nn.init.normal_(model.forces.force.weight, std=0.1)
+
+    def stack(index):
+        members = [pair[index] for pair in pairs]
+        fewer = members[1].moving.clone()
+        fewer[0, 150:200] = False  # member 1 has fewer candidates, so its gathered set is padded
+        keep = members[1].mask.clone()
+        keep[0, 150:200] = False
+        members[1] = replace(members[1], moving=fewer, mask=keep)
+        names = ("positions", "features", "mask", "colors", "moving", "normals")
+        return members, Particles(**{n: torch.cat([getattr(m, n) for m in members]) for n in names})
+
+    _, current = stack(1)
+    (_, lone_current), previous = stack(1)[0], None
+    previous = replace(current, positions=current.positions - 0.02)
+    together = roll(model, previous, current, 2)
+    alone = roll(
+        model, replace(lone_current, positions=lone_current.positions - 0.02), lone_current, 2
+    )
+
+    kept = lone_current.mask[0]
+    assert torch.allclose(together[-1].positions[1, kept], alone[-1].positions[0, kept], atol=1e-8)
+
+
+def test_every_parameter_receives_a_finite_gradient():
+    previous, current = tossed()
+    model = dynamics()
+    torch.nn.init.normal_(model.forces.force.weight, std=0.1)
+    torch.nn.init.normal_(model.forces.damping.weight, std=0.1)
+
+    states = roll(model, previous, current, 3)
+    (states[-1].positions.square().sum() + states[-1].features.square().sum()).backward()
+
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
+
+
+def test_a_scene_without_candidates_does_not_move():
+    _, current = tossed()
+    current = replace(current, moving=torch.zeros_like(current.moving))
+
+    states = roll(dynamics(), current, current, 3)
+
+    assert torch.equal(states[-1].positions, current.positions)
+    assert torch.isfinite(states[-1].features).all()
+
+
+def test_without_observed_normals_it_says_what_to_set():
+    _, current = tossed()
+    with pytest.raises(ValueError, match="use_normals"):
+        dynamics().initialize(current, replace(current, normals=None), RandomKeys.fixed(1))
+
+
+@pytest.mark.parametrize("changes", [{"num_anchors": 0}, {"anchor_radius": 0.0}, {"shadow_scales": [0.0]}])
+def test_wrong_settings_are_refused(changes):
+    with pytest.raises(ValueError):
+        dynamics(**changes)

@@ -1,0 +1,150 @@
+import pytest
+import torch
+
+from vpd_lightning.encoder.background import BackgroundModel
+from vpd_lightning.encoder.unet import UNetEncoder
+from vpd_lightning.encoder.unet_network import UNetNetwork
+from vpd_lightning.errors import DataError, EmptyWorkspaceError
+from vpd_lightning.geometry.cameras import project
+from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.types import Cameras, RGBDFrames
+
+
+def looking_down(num_views=2, size=8):
+    cam_to_world = torch.eye(4).repeat(num_views, 1, 1)
+    cam_to_world[:, :3, :3] = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    cam_to_world[:, 2, 3] = 2.0
+    cam_to_world[:, 0, 3] = torch.arange(num_views) * 0.1
+    intrinsics = torch.tensor([[8.0, 0, 4.0], [0, 8.0, 4.0], [0, 0, 1]]).expand(num_views, 3, 3)
+    return Cameras(intrinsics, cam_to_world, size, size)
+
+
+def frames(batch=2, num_views=2, size=8, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    cameras = looking_down(num_views, size)
+    return RGBDFrames(
+        torch.randint(0, 256, (batch, num_views, size, size, 3), generator=generator, dtype=torch.uint8),
+        torch.full((batch, num_views, size, size), 2.0),
+        Cameras(cameras.intrinsics.expand(batch, -1, 3, 3), cameras.cam_to_world.expand(batch, -1, 4, 4), size, size),
+    )
+
+
+def encoder(**changes):
+    arguments = {
+        "channels": [8, 12, 8, 12, 5],
+        "num_particles": 40,
+        "workspace_min": [-2, -2, -1],
+        "workspace_max": [2, 2, 1],
+        "moving_fraction": None,
+        "background": None,
+        "use_normals": False,
+    }
+    return UNetEncoder(**{**arguments, **changes})
+
+
+def test_particles_lie_on_measured_surfaces_with_positive_features():
+    particles = encoder()(frames(), RandomKeys.fixed(2), "current").particles
+
+    assert particles.positions.shape == (2, 40, 3) and particles.features.shape == (2, 40, 5)
+    assert particles.mask.all()
+    assert particles.positions[..., 2].abs().max() < 1e-5
+    assert (particles.features > 0).all()
+
+
+def test_a_particle_carries_the_features_and_colour_of_its_pixel():
+    model, data = encoder(), frames(batch=1, num_views=1)
+
+    particles = model(data, RandomKeys.fixed(1), "current").particles
+
+    pixels, _ = project(particles.positions[0], data.cameras[0, 0])
+    x, y = pixels.floor().long().unbind(-1)
+    features = model.pixel_features(data.rgb.float() / 255)[0, 0]
+    assert torch.allclose(particles.features[0], features[y, x], atol=1e-6)
+    assert torch.allclose(particles.colors[0], data.rgb[0, 0, y, x].float() / 255)
+
+
+def test_a_batch_equals_its_members():
+    model, data = encoder(), frames()
+    together = model(data, RandomKeys(0, 3, [0, 1]), "current").particles
+
+    alone = model(data[1:], RandomKeys(0, 3, [1]), "current").particles
+
+    assert torch.equal(together.positions[1:], alone.positions)
+    assert torch.allclose(together.features[1:], alone.features, atol=1e-6)
+
+
+def test_missing_depth_and_pixels_outside_the_workspace_make_no_particles():
+    data = frames(batch=1, num_views=1)
+    data.depth[0, 0, :, :4] = 0.0
+    data.depth[0, 0, 0] = float("nan")
+
+    particles = encoder(num_particles=64)(data, RandomKeys.fixed(1), "current").particles
+
+    assert int(particles.mask.sum()) == 7 * 4
+    assert torch.isfinite(particles.positions).all() and torch.isfinite(particles.features).all()
+    assert (particles.positions[~particles.mask] == 0).all()
+
+
+def test_an_empty_workspace_is_an_error_that_says_what_to_check():
+    with pytest.raises(EmptyWorkspaceError, match="workspace"):
+        encoder(workspace_min=[5, 5, 5], workspace_max=[6, 6, 6])(frames(), RandomKeys.fixed(2), "current")
+
+
+def test_image_sizes_that_the_network_cannot_halve_are_refused():
+    with pytest.raises(ValueError, match="multiple of 4"):
+        UNetNetwork(channels=[4, 4, 4, 4, 4], in_channels=3)(torch.zeros(1, 3, 6, 8))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_particles": 0}, "num_particles"),
+        ({"workspace_min": [3, 0, 0]}, "workspace_min"),
+        ({"moving_fraction": 0.5}, "background"),
+        ({"channels": [4, 4]}, "channels"),
+    ],
+)
+def test_wrong_settings_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        encoder(**changes)
+
+
+def fitted_background(data):
+    model = BackgroundModel(num_views=2, height=8, width=8, depth_threshold=0.02, color_threshold=0.3)
+    model.fit(data.rgb[0], data.depth[0], data.cameras[0])
+    return model
+
+
+def test_background_marks_what_stands_in_front_and_particles_favour_it():
+    data = frames(batch=1)
+    background = fitted_background(data)
+    closer = RGBDFrames(data.rgb, data.depth.clone(), data.cameras)
+    closer.depth[0, 1, 2:4, 2:4] = 1.5
+
+    moving = background(closer)
+    model = encoder(moving_fraction=0.25, background=background)
+    particles = model(closer, RandomKeys.fixed(1), "current").particles
+
+    assert int(moving.sum()) == 4 and moving[0, 1, 2:4, 2:4].all()
+    assert int(particles.moving.sum()) == 4
+    assert (particles.positions[particles.moving][:, 2] > 0.4).all()
+    assert "background.depth" in model.state_dict()
+
+
+def test_background_finds_its_cameras_in_any_order_and_refuses_strangers():
+    data = frames(batch=1)
+    background = fitted_background(data)
+    swapped = RGBDFrames(data.rgb.flip(1), data.depth, Cameras(
+        data.cameras.intrinsics, data.cameras.cam_to_world.flip(1), 8, 8))  # fmt: skip
+    assert not background(swapped).any()
+
+    stranger = data.cameras.cam_to_world.clone()
+    stranger[..., 1, 3] += 0.5
+    with pytest.raises(DataError, match="fixed cameras"):
+        background(RGBDFrames(data.rgb, data.depth, Cameras(data.cameras.intrinsics, stranger, 8, 8)))
+
+
+def test_background_must_be_fitted_first():
+    model = BackgroundModel(num_views=2, height=8, width=8, depth_threshold=0.02, color_threshold=0.3)
+    with pytest.raises(DataError, match="fitted"):
+        model(frames())
