@@ -1,0 +1,113 @@
+"""Settings of a scene: YAML presets in ``conf/data_gen/<scene>/``, checked against the scene's dataclass."""
+
+import difflib
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from vpd_lightning.errors import ConfigError
+
+Settings = TypeVar("Settings")
+
+
+def preset_folder() -> Path:
+    """Return ``conf/data_gen``: beside this package in a checkout, inside ``vpd_lightning`` in an installed wheel."""
+    import vpd_lightning
+
+    beside = Path(__file__).resolve().parent.parent / "conf" / "data_gen"
+    inside = [Path(folder) / "conf" / "data_gen" for folder in vpd_lightning.__path__]
+    for folder in (beside, *inside):
+        if folder.is_dir():
+            return folder
+    raise ConfigError(f"The presets are missing: neither {beside} nor {inside[0]} exists. Reinstall the package.")
+
+
+def scene_names() -> list[str]:
+    """Return the scenes that can be generated."""
+    return sorted(folder.name for folder in preset_folder().iterdir() if folder.is_dir())
+
+
+def preset_names(scene: str) -> list[str]:
+    """Return the presets of a scene."""
+    return sorted(path.stem for path in (preset_folder() / scene).glob("*.yaml"))
+
+
+def require_choice(what: str, value: str, choices: Sequence[str]) -> None:
+    """Refuse a value that is not among the choices, with the nearest one."""
+    if value not in choices:
+        raise ConfigError(f"{what}={value} is unknown{did_you_mean(value, choices)}\nAvailable: {', '.join(choices)}.")
+
+
+def did_you_mean(value: str, choices: Iterable[str]) -> str:
+    """Return ``; did you mean 'x'?`` or a full stop."""
+    near = difflib.get_close_matches(value, list(choices), n=1)
+    return f"; did you mean {near[0]!r}?" if near else "."
+
+
+def load_settings(schema: type[Settings], scene: str, preset: str, overrides: Mapping[str, Any]) -> Settings:
+    """Read a preset, apply overrides (nested, or with dotted keys) and check names, types and ranges.
+
+    Raises:
+        ConfigError: unknown scene, preset or key (with the nearest name), a value of the wrong type or out of range.
+    """
+    require_choice("scene", scene, scene_names())
+    require_choice("preset", preset, preset_names(scene))
+    base = OmegaConf.load(preset_folder() / scene / f"{preset}.yaml")
+    assert isinstance(base, DictConfig)
+    changes = OmegaConf.create()
+    for key, value in overrides.items():
+        OmegaConf.update(changes, key, value)
+    known = _leaf_names(OmegaConf.to_container(base))
+    for key in _leaf_names(OmegaConf.to_container(changes)):
+        members = [name for name in known if name.startswith(key + ".")]
+        if members:
+            raise ConfigError(f"{key} is a group of settings; set its members: {', '.join(members)}.")
+        if key not in known:
+            raise ConfigError(
+                f"Unknown setting {key!r}{did_you_mean(key, known)}\n"
+                f"Settings of this scene are listed in {preset_folder() / scene / (preset + '.yaml')}."
+            )
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(schema), base, changes)
+        settings = OmegaConf.to_object(merged)
+    except OmegaConfBaseException as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ConfigError(f"{error.full_key or scene}: {reason} (scene {scene}, preset {preset}).") from error
+    except ValueError as error:
+        raise ConfigError(f"{error} (scene {scene}, preset {preset}).") from error
+    assert isinstance(settings, schema)
+    return settings
+
+
+def settings_hash(identity: Mapping[str, Any]) -> str:
+    """Return 16 hexadecimal digits that change with any of the settings."""
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    """Name the leaves in which two nested settings differ, as ``key: first instead of second``."""
+    left, right = _leaves(first), _leaves(second)
+    return [
+        f"{key}: {left.get(key)} instead of {right.get(key)}"
+        for key in dict.fromkeys([*left, *right])
+        if left.get(key) != right.get(key)
+    ]
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    leaves: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            leaves.update(_leaves(value, f"{prefix}{key}."))
+        else:
+            leaves[f"{prefix}{key}"] = list(value) if isinstance(value, tuple) else value
+    return leaves
+
+
+def _leaf_names(tree: Any) -> list[str]:
+    return list(_leaves(tree))

@@ -1,0 +1,80 @@
+"""What runs in each worker process: one scene, built once, and one file per job."""
+
+import os
+import signal
+from importlib import import_module
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+_state: dict[str, Any] = {}
+
+
+class StopEvent(Protocol):
+    """A flag that the parent sets when everybody should leave."""
+
+    def is_set(self) -> bool:
+        """Tell whether it is set."""
+        ...
+
+
+class Stopped(Exception):  # noqa: N818 - not an error: the parent asked for it
+    """The parent is leaving."""
+
+
+def environment(backend: str) -> dict[str, str]:
+    """Return the variables that workers need before they import anything."""
+    variables = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    if backend != "raycast":
+        # llvmpipe's own threads only disturb when every core has its own worker.
+        variables |= {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend, "LP_NUM_THREADS": "0"}
+    return variables
+
+
+def start(scene: str, settings: Any, backend: str, stop_event: StopEvent | None) -> None:
+    """Build the scene of this process.
+
+    With a ``stop_event`` this is a worker: Ctrl-C is left to the parent, which sets the event, and SIGTERM unwinds, so
+    that a half-written file is removed. Both signals arrive blocked (see ``data_gen.pool``).
+    """
+    if stop_event is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, _leave)
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
+    _state["scene"] = import_module(f"data_gen.{scene}").Scene(settings, backend)
+    _state["storage"] = settings.storage
+    _state["stop"] = stop_event
+    _state["parent"] = os.getppid()
+
+
+def stop() -> None:
+    """Free the scene."""
+    scene = _state.pop("scene", None)
+    if scene is not None:
+        scene.close()
+
+
+def make_file(seed: int, split: str, index: int, path: Path, scene_hash: str) -> str:
+    """Simulate, render and write one trajectory; return the SHA-256 of its file."""
+    from vpd_lightning.data.manifest import file_sha256
+    from vpd_lightning.data.schema import write_trajectory
+
+    trajectory = _state["scene"].trajectory(seed, split, index, scene_hash, _check_stop)
+    storage = _state["storage"]
+    write_trajectory(path, trajectory, compression=storage.compression, depth_encoding=storage.depth_encoding)
+    return file_sha256(path)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
+
+
+def _check_stop() -> None:
+    event = _state["stop"]
+    if event is None:
+        return
+    if event.is_set():
+        raise Stopped
+    if os.getppid() != _state["parent"]:  # the parent was killed: nobody wants the rest
+        raise Stopped

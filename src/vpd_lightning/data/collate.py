@@ -1,0 +1,48 @@
+"""Training samples to batches."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.types import Cameras, Rays, RGBDFrames, VideoBatch
+
+
+@dataclass(frozen=True)
+class ClipSample:
+    """One member of a batch, as a loader worker makes it; ``step`` and ``sample_index`` say which one."""
+
+    rgb: UInt8[Tensor, "time view height width 3"]
+    depth: Float[Tensor, "time view height width"]
+    intrinsics: Float[Tensor, "time view 3 3"]
+    cam_to_world: Float[Tensor, "time view 4 4"]
+    origins: Float[Tensor, "step ray 3"]
+    directions: Float[Tensor, "step ray 3"]
+    rgbs: Float[Tensor, "step ray 3"]
+    seed: int
+    step: int
+    sample_index: int
+    clip: str
+
+
+def collate_clips(samples: Sequence[ClipSample]) -> VideoBatch:
+    """Stack samples of one training step to a batch."""
+    steps = {sample.step for sample in samples}
+    if len(steps) != 1:
+        raise ValueError(f"a batch holds samples of one training step, got steps {sorted(steps)}")
+
+    def stack(name: str) -> Tensor:
+        return torch.stack([getattr(sample, name) for sample in samples])
+
+    height, width = samples[0].depth.shape[-2:]
+    cameras = Cameras(stack("intrinsics"), stack("cam_to_world"), height, width)
+    return VideoBatch(
+        context=RGBDFrames(stack("rgb"), stack("depth"), cameras),
+        rays=Rays(stack("origins"), stack("directions")),
+        rgbs=stack("rgbs"),
+        keys=RandomKeys(samples[0].seed, samples[0].step, [sample.sample_index for sample in samples]),
+        clips=[sample.clip for sample in samples],
+    )

@@ -1,0 +1,180 @@
+"""``dataset.json``: which trajectories a data set holds, in which split, and the SHA-256 of each file."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from vpd_lightning.data.schema import SCHEMA_VERSION, AtomicPath
+from vpd_lightning.errors import DataError
+
+FILE_NAME = "dataset.json"
+SPLITS = ("train", "validation", "test")
+_MAX_BYTES = 64 * 2**20
+_MAX_TRAJECTORIES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A data set on disk. ``splits`` holds absolute paths; ``sha256`` and ``num_bytes`` go by the relative name."""
+
+    folder: Path
+    name: str
+    scene: str
+    preset: str
+    seed: int
+    splits: dict[str, list[Path]]
+    sha256: dict[str, str]
+    num_bytes: dict[str, int]
+    settings: dict[str, Any] = field(default_factory=dict)
+    generator: str = ""
+    versions: dict[str, str] = field(default_factory=dict)
+    license: str = ""
+
+    def relative(self, path: Path) -> str:
+        """Return a trajectory's name as the manifest writes it, for example ``train/000000.h5``."""
+        return path.relative_to(self.folder).as_posix()
+
+    def split(self, name: str) -> list[Path]:
+        """Return the files of one split, or raise ``DataError`` naming the splits there are."""
+        if not self.splits.get(name):
+            present = ", ".join(f"{key} ({len(files)})" for key, files in self.splits.items() if files) or "none"
+            raise DataError(f"{self.folder} has no split {name!r}.\nSplits with trajectories: {present}.")
+        return self.splits[name]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the names and checksums of all files: two data sets with one digest hold the same bytes."""
+        lines = "".join(f"{name} {value}\n" for name, value in sorted(self.sha256.items()))
+        return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def write_manifest(manifest: Manifest) -> Path:
+    """Write ``dataset.json`` atomically, after all trajectories, and return its path."""
+    content = {
+        "schema_version": SCHEMA_VERSION,
+        "name": manifest.name,
+        "scene": manifest.scene,
+        "preset": manifest.preset,
+        "seed": manifest.seed,
+        "license": manifest.license,
+        "generator": manifest.generator,
+        "versions": manifest.versions,
+        "settings": manifest.settings,
+        "splits": {
+            split: [
+                {
+                    "file": manifest.relative(path),
+                    "sha256": manifest.sha256[manifest.relative(path)],
+                    "bytes": manifest.num_bytes[manifest.relative(path)],
+                }
+                for path in files
+            ]
+            for split, files in manifest.splits.items()
+        },
+    }
+    path = manifest.folder / FILE_NAME
+    with AtomicPath(path) as partial:
+        partial.write_text(json.dumps(content, indent=1) + "\n")
+    return path
+
+
+def load_manifest(folder: str | Path) -> Manifest:
+    """Read ``dataset.json`` and check that every file it names is there with its size.
+
+    Raises:
+        DataError: the data set is missing (the message holds the command that makes it), incomplete or damaged.
+    """
+    folder = Path(folder).expanduser().absolute()
+    path = folder / FILE_NAME
+    if not path.is_file():
+        raise DataError(_missing(folder))
+    if path.stat().st_size > _MAX_BYTES:
+        raise DataError(f"{path} has {path.stat().st_size} bytes, more than the allowed {_MAX_BYTES}.")
+    try:
+        content = json.loads(path.read_text())
+    except (ValueError, OSError) as error:
+        raise DataError(f"{path} cannot be read: {error}.\nRestore it, or generate the data set again.") from error
+    version = content.get("schema_version") if isinstance(content, dict) else None
+    if version != SCHEMA_VERSION:
+        raise DataError(f"{path} has schema version {version!r}; this program reads version {SCHEMA_VERSION}.")
+    try:
+        return _parse(folder, content)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise DataError(f"{path} is not a manifest: {type(error).__name__} {error}.") from error
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file as hexadecimal digits."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _parse(folder: Path, content: Mapping[str, Any]) -> Manifest:
+    splits: dict[str, list[Path]] = {}
+    sha256: dict[str, str] = {}
+    num_bytes: dict[str, int] = {}
+    for split, entries in content["splits"].items():
+        splits[split] = []
+        for entry in entries:
+            name = str(entry["file"])
+            path = _inside(folder, name)
+            splits[split].append(path)
+            sha256[name], num_bytes[name] = str(entry["sha256"]), int(entry["bytes"])
+    if len(sha256) != sum(map(len, splits.values())):
+        raise DataError(f"{folder / FILE_NAME} names a trajectory twice; splits must not share files.")
+    if len(sha256) > _MAX_TRAJECTORIES:
+        raise DataError(f"{folder / FILE_NAME} names {len(sha256)} files, more than the allowed {_MAX_TRAJECTORIES}.")
+    _check_files(folder, num_bytes)
+    return Manifest(
+        folder=folder,
+        name=str(content["name"]),
+        scene=str(content["scene"]),
+        preset=str(content.get("preset", "")),
+        seed=int(content.get("seed", 0)),
+        splits=splits,
+        sha256=sha256,
+        num_bytes=num_bytes,
+        settings=dict(content.get("settings", {})),
+        generator=str(content.get("generator", "")),
+        versions={str(key): str(value) for key, value in content.get("versions", {}).items()},
+        license=str(content.get("license", "")),
+    )
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """Refuse names that lead out of the data set: a manifest from elsewhere must not point at other files."""
+    relative = PurePosixPath(name)
+    if relative.is_absolute() or ".." in relative.parts or "\\" in name or relative.suffix != ".h5":
+        raise DataError(f"{folder / FILE_NAME} names {name!r}; only .h5 files inside the data set are allowed.")
+    return folder / relative
+
+
+def _check_files(folder: Path, num_bytes: Mapping[str, int]) -> None:
+    faults = []
+    for name, expected in num_bytes.items():
+        path = folder / name
+        if not path.is_file():
+            faults.append(f"{name} is missing")
+        elif path.stat().st_size != expected:
+            faults.append(f"{name} has {path.stat().st_size} bytes instead of {expected}")
+    if faults:
+        raise DataError(
+            f"{folder}: {len(faults)} of {len(num_bytes)} trajectories are missing or damaged.\n"
+            f"First: {faults[0]}.\n"
+            f"Copy the data set again, or delete its {FILE_NAME} and damaged files and generate them again (the others "
+            "are kept)."
+        )
+
+
+def _missing(folder: Path) -> str:
+    scene, _, preset = folder.name.rpartition("_")
+    if preset not in ("paper", "demo", "tiny") or not scene:
+        scene, preset = "mujoco_block", "demo"
+    return (
+        f"No data set in {folder} (there is no {FILE_NAME}).\n"
+        f"Make it:  vpd-data generate scene={scene} preset={preset} out={folder}\n"
+        "or point data.folder at one that exists."
+    )

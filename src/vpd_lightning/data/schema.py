@@ -1,0 +1,183 @@
+"""The HDF5 file of one trajectory, schema version 1: names, shapes, dtypes, and an atomic writer.
+
+Readable with h5py alone::
+
+    rgb          (time, view, height, width, 3) uint8      sRGB
+    depth        (time, view, height, width)    float32    z-depth in metres, 0 = no measurement
+                                                (or uint16 with attributes ``scale`` and ``offset``)
+    intrinsics   (view, 3, 3) or (time, view, 3, 3) float64    pixels, pixel centres at +0.5
+    cam_to_world (view, 4, 4) or (time, view, 4, 4) float64    OpenCV camera axes, metres
+    state/       optional ground truth, for evaluation only (see ``data.ground_truth``)
+    attributes   schema_version, frame_time (s), near, far (m along the ray), workspace_min, workspace_max (m),
+                 depth_type = "z", source_depth_type, seed, engine, scene_hash
+"""
+
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+SCHEMA_VERSION = 1
+DEPTH_TYPE = "z"
+RGB, DEPTH, INTRINSICS, CAM_TO_WORLD, STATE = "rgb", "depth", "intrinsics", "cam_to_world", "state"
+STATE_POSITIONS = "positions"  # (time, object, 3) m, world
+STATE_QUATERNIONS = "quaternions"  # (time, object, 4) w x y z, body to world
+STATE_LINEAR_VELOCITIES = "linear_velocities"  # (time, object, 3) m/s, world, of the centre of mass
+STATE_ANGULAR_VELOCITIES = "angular_velocities"  # (time, object, 3) rad/s, world
+STATE_HALF_SIZES = "half_sizes"  # (object, 3) m, along the body's own axes
+STATE_SEGMENTATION = "segmentation"  # (time, view, height, width) uint8, 0 background, i + 1 object i
+COMPRESSIONS = ("lzf", "gzip", "none")
+DEPTH_ENCODINGS = ("float32", "uint16")
+PARTIAL_SUFFIX = ".partial"
+_UINT16_STEPS = 65534  # 0 means no measurement, 1..65535 cover [near, far of the data]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Everything one file holds; ``ValueError`` for arrays without the shapes and dtypes of this module's table."""
+
+    rgb: NDArray[Any]
+    depth: NDArray[Any]
+    intrinsics: NDArray[Any]
+    cam_to_world: NDArray[Any]
+    frame_time: float
+    near: float
+    far: float
+    workspace_min: tuple[float, float, float]
+    workspace_max: tuple[float, float, float]
+    seed: int = 0
+    source_depth_type: str = DEPTH_TYPE
+    engine: str = ""
+    scene_hash: str = ""
+    state: Mapping[str, NDArray[Any]] | None = None
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        time, view, height, width = self.depth.shape
+        _require("rgb", self.rgb, np.uint8, [(time, view, height, width, 3)])
+        _require("depth", self.depth, np.float32, [(time, view, height, width)])
+        for name, size in ((INTRINSICS, 3), (CAM_TO_WORLD, 4)):
+            _require(name, getattr(self, name), np.float64, [(view, size, size), (time, view, size, size)])
+
+
+def _require(name: str, array: NDArray[Any], dtype: type, shapes: list[tuple[int, ...]]) -> None:
+    if array.dtype != dtype or array.shape not in shapes:
+        allowed = " or ".join(map(str, shapes))
+        raise ValueError(f"{name} is {array.dtype} {array.shape}; it must be {np.dtype(dtype)} {allowed}")
+
+
+def write_trajectory(
+    path: Path, trajectory: Trajectory, *, compression: str = "lzf", depth_encoding: str = "float32"
+) -> None:
+    """Write one file so that ``path`` either does not exist or is complete, even after a power cut.
+
+    The file is written under a temporary name in the same folder, flushed to disk, and renamed. One chunk is one image
+    of one view, with a Fletcher-32 checksum. ``depth_encoding="uint16"`` stores depth in 65,534 equal steps between the
+    smallest and largest measured depth (0.036 mm error over 0.3-5 m) in a fifth of the space.
+    """
+    if compression not in COMPRESSIONS:
+        raise ValueError(f"compression is {compression!r}; allowed: {', '.join(COMPRESSIONS)}")
+    if depth_encoding not in DEPTH_ENCODINGS:
+        raise ValueError(f"depth_encoding is {depth_encoding!r}; allowed: {', '.join(DEPTH_ENCODINGS)}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with AtomicPath(path) as partial, h5py.File(partial, "w", libver=("v110", "v110")) as file:
+        _write_attributes(file, trajectory)
+        _write_images(file, RGB, trajectory.rgb, compression)
+        if depth_encoding == "uint16":
+            encoded, scale, offset = encode_depth(trajectory.depth)
+            dataset = _write_images(file, DEPTH, encoded, compression)
+            dataset.attrs["scale"], dataset.attrs["offset"] = scale, offset
+        else:
+            _write_images(file, DEPTH, trajectory.depth, compression)
+        file.create_dataset(INTRINSICS, data=trajectory.intrinsics)
+        file.create_dataset(CAM_TO_WORLD, data=trajectory.cam_to_world)
+        if trajectory.state is not None:
+            group = file.create_group(STATE)
+            for name, values in trajectory.state.items():
+                if name == STATE_SEGMENTATION:
+                    _write_images(group, name, values, compression)
+                else:
+                    group.create_dataset(name, data=values)
+
+
+def encode_depth(depth: NDArray[np.float32]) -> tuple[NDArray[np.uint16], float, float]:
+    """Quantise depth in metres to uint16; gives ``(codes, scale, offset)`` with ``depth = offset + scale * code``."""
+    valid = np.isfinite(depth) & (depth > 0)
+    if not valid.any():
+        return np.zeros(depth.shape, np.uint16), 1.0, 0.0
+    low, high = float(depth[valid].min()), float(depth[valid].max())
+    scale = max(high - low, 1e-6) / _UINT16_STEPS
+    offset = low - scale
+    codes = np.zeros(depth.shape, np.uint16)
+    codes[valid] = np.rint((depth[valid].astype(np.float64) - offset) / scale).astype(np.uint16)
+    return codes, scale, offset
+
+
+def decode_depth(codes: NDArray[np.uint16], scale: float, offset: float) -> NDArray[np.float32]:
+    """Undo ``encode_depth``; code 0 gives 0 (no measurement)."""
+    return np.where(codes == 0, 0.0, offset + scale * codes.astype(np.float64)).astype(np.float32)
+
+
+def _write_attributes(file: h5py.File, trajectory: Trajectory) -> None:
+    file.attrs["schema_version"] = SCHEMA_VERSION
+    file.attrs["depth_type"] = DEPTH_TYPE
+    for name in ("frame_time", "near", "far", "seed", "source_depth_type", "engine", "scene_hash"):
+        file.attrs[name] = getattr(trajectory, name)
+    file.attrs["workspace_min"] = np.asarray(trajectory.workspace_min, np.float64)
+    file.attrs["workspace_max"] = np.asarray(trajectory.workspace_max, np.float64)
+    for name, value in trajectory.attributes.items():
+        file.attrs[name] = value
+
+
+def _write_images(group: h5py.Group, name: str, images: NDArray[Any], compression: str) -> h5py.Dataset:
+    return group.create_dataset(
+        name,
+        data=images,
+        chunks=(1, 1, *images.shape[2:]),
+        compression=None if compression == "none" else compression,
+        shuffle=images.dtype.itemsize > 1,
+        fletcher32=True,
+    )
+
+
+class AtomicPath:
+    """Context manager: gives a temporary path beside ``path``, which becomes ``path`` when the block succeeds.
+
+    What was written is flushed to disk before the rename; after an exception the temporary file is gone and ``path`` is
+    as it was.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.partial: Path | None = None
+
+    def __enter__(self) -> Path:
+        handle, name = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.", suffix=PARTIAL_SUFFIX)
+        os.close(handle)
+        self.partial = Path(name)
+        return self.partial
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        assert self.partial is not None
+        try:
+            if kind is None:
+                self.partial.chmod(0o644)
+                _flush(self.partial)
+                os.replace(self.partial, self.path)
+                _flush(self.path.parent)
+        finally:
+            self.partial.unlink(missing_ok=True)
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,72 @@
+"""Fixed clips of a held-out split, with whole frames to compare with."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch.utils.data import Dataset
+
+from vpd_lightning.data.dataset import NUM_CONTEXT_FRAMES, require_clips
+from vpd_lightning.data.frames import TrajectoryFrames
+from vpd_lightning.types import Cameras, RGBDFrames
+
+
+@dataclass(frozen=True)
+class VideoClip:
+    """Two context frames (axes ``time=2 view``) and the frames after them (axes ``time view``)."""
+
+    context: RGBDFrames
+    target: RGBDFrames
+    name: str
+
+    def to(self, *args: Any, **kwargs: Any) -> "VideoClip":
+        """Move both parts to a device or floating dtype."""
+        return replace(self, context=self.context.to(*args, **kwargs), target=self.target.to(*args, **kwargs))
+
+
+class ValidationClips(Dataset[VideoClip]):
+    """Clip ``i`` is the i-th of an even spread over the trajectories and over the start frames that leave room."""
+
+    def __init__(
+        self,
+        *,
+        trajectories: Sequence[TrajectoryFrames],
+        num_clips: int,
+        num_steps: int,
+        input_views: Sequence[int],
+        target_views: Sequence[int],
+        start_frames: Sequence[int] | None,
+    ) -> None:
+        require_clips(trajectories, num_steps, [*input_views, *target_views], start_frames)
+        self.num_steps = num_steps
+        self.input_views, self.target_views = list(input_views), list(target_views)
+        self.clips: list[tuple[TrajectoryFrames, int]] = []
+        for index in range(num_clips):
+            lap, place = divmod(index, len(trajectories))
+            laps = -(-num_clips // len(trajectories))
+            trajectory = trajectories[place]
+            latest = trajectory.num_frames - NUM_CONTEXT_FRAMES - num_steps
+            starts = list(range(latest + 1)) if start_frames is None else list(start_frames)
+            self.clips.append((trajectory, starts[lap * len(starts) // laps]))
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, index: int) -> VideoClip:
+        trajectory, start = self.clips[index]
+        first_target = start + NUM_CONTEXT_FRAMES
+        return VideoClip(
+            context=_frames(trajectory, range(start, first_target), self.input_views),
+            target=_frames(trajectory, range(first_target, first_target + self.num_steps), self.target_views),
+            name=f"{trajectory.path.parent.name}/{trajectory.path.name}@{start}",
+        )
+
+
+def _frames(trajectory: TrajectoryFrames, times: Sequence[int], views: Sequence[int]) -> RGBDFrames:
+    intrinsics, cam_to_world = (torch.from_numpy(part).float() for part in trajectory.cameras(times, views))
+    return RGBDFrames(
+        rgb=torch.from_numpy(trajectory.rgb(times, views)),
+        depth=torch.from_numpy(trajectory.depth(times, views)),
+        cameras=Cameras(intrinsics, cam_to_world, trajectory.height, trajectory.width),
+    )
