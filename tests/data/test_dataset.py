@@ -1,5 +1,6 @@
 """Training clips: what they hold, and that they depend on (seed, step, sample index) alone."""
 
+import pickle
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -209,3 +210,9 @@ def test_images_of_different_sizes_are_refused(files: list[Path], tmp_path: Path
 def test_an_empty_split_is_refused() -> None:
     with pytest.raises(DataError, match="no trajectory"):
         require_clips([], 1, [0], None)
+
+
+def test_a_dataset_that_was_sent_to_another_process_gives_the_same_samples(files: list[Path]) -> None:
+    data = dataset(frames(files))
+    expected = data[3]
+    assert_same(pickle.loads(pickle.dumps(data))[3], expected)  # open files stay behind

@@ -110,7 +110,7 @@ def test_wrong_settings_are_refused(changes, message):
 
 
 def fitted_background(data):
-    model = BackgroundModel(num_views=2, height=8, width=8, depth_threshold=0.02, color_threshold=0.3)
+    model = BackgroundModel(num_views=2, height=8, width=8, depth_threshold=0.02)
     model.fit(data.rgb[0], data.depth[0], data.cameras[0])
     return model
 
@@ -145,6 +145,6 @@ def test_background_finds_its_cameras_in_any_order_and_refuses_strangers():
 
 
 def test_background_must_be_fitted_first():
-    model = BackgroundModel(num_views=2, height=8, width=8, depth_threshold=0.02, color_threshold=0.3)
+    model = BackgroundModel(num_views=2, height=8, width=8, depth_threshold=0.02)
     with pytest.raises(DataError, match="fitted"):
         model(frames())

@@ -1,4 +1,4 @@
-"""What is static in front of fixed cameras: the training-median image and depth of each camera."""
+"""What stands still in front of fixed cameras: the training-median depth of each camera."""
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -9,18 +9,19 @@ from vpd_lightning.types import Cameras, RGBDFrames
 
 
 class BackgroundModel(nn.Module):
-    """Marks pixels that lie in front of the training-median depth of the same camera, or whose colour differs from it.
+    """Marks pixels that lie nearer than the training-median depth of the same camera.
 
-    Uses no labels, but fixed cameras. Depth tells bodies from their shadows; colour catches what depth misses near
-    the floor, so its threshold is high. Both medians live in the state dict.
+    Uses no labels, but fixed cameras. Depth, unlike colour, tells bodies from their shadows. The median images live in
+    the state dict.
     """
 
     # Paper: not in the paper; it gives the inertial dynamics its candidates for motion.
 
-    def __init__(self, *, num_views: int, height: int, width: int, depth_threshold: float, color_threshold: float):
+    def __init__(self, *, num_views: int, height: int, width: int, depth_threshold: float):
         super().__init__()
-        self.depth_threshold, self.color_threshold = depth_threshold, color_threshold
-        self.register_buffer("rgb", torch.zeros(num_views, height, width, 3, dtype=torch.uint8))
+        if depth_threshold <= 0:
+            raise ValueError(f"depth_threshold must be positive, got {depth_threshold}")
+        self.depth_threshold = depth_threshold
         self.register_buffer("depth", torch.zeros(num_views, height, width))
         self.register_buffer("cam_to_world", torch.zeros(num_views, 4, 4))
         self.register_buffer("is_fitted", torch.tensor(False))
@@ -31,13 +32,12 @@ class BackgroundModel(nn.Module):
         depth: Float[Tensor, "view height width"],
         cameras: Cameras,
     ) -> None:
-        """Store the median images (uint8, metres) and the poses of the cameras that took them."""
-        if rgb.shape != self.rgb.shape:
+        """Store the median depth (metres) and the poses of the cameras that took it; colours are not used."""
+        if depth.shape != self.depth.shape:
             raise DataError(
-                f"background images are {tuple(rgb.shape)}, the model expects {tuple(self.rgb.shape)}.\n"
+                f"background images are {tuple(depth.shape)}, the model expects {tuple(self.depth.shape)}.\n"
                 "Set encoder.background.num_views, height and width to the data's."
             )
-        self.rgb.copy_(rgb)
         self.depth.copy_(torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0))
         self.cam_to_world.copy_(cameras.cam_to_world)
         self.is_fitted.fill_(True)
@@ -53,10 +53,7 @@ class BackgroundModel(nn.Module):
         index = self._match(frames.cameras)
         background_depth = self.depth[index]
         nearer = (background_depth - frames.depth > self.depth_threshold) | (background_depth <= 0)
-        rgb = frames.rgb if frames.rgb.is_floating_point() else frames.rgb.to(frames.depth.dtype) / 255
-        difference = (rgb - self.rgb[index].to(rgb.dtype) / 255).abs().amax(dim=-1)
-        measured = torch.isfinite(frames.depth) & (frames.depth > 0)
-        return (nearer | (difference > self.color_threshold)) & measured
+        return nearer & torch.isfinite(frames.depth) & (frames.depth > 0)
 
     def _match(self, cameras: Cameras) -> Tensor:
         gap = (cameras.cam_to_world.to(self.cam_to_world.dtype)[..., None, :, :] - self.cam_to_world).abs()

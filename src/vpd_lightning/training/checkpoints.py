@@ -1,0 +1,56 @@
+"""Finding the checkpoint to go on from."""
+
+import logging
+from pathlib import Path
+
+from vpd_lightning.errors import CheckpointError
+from vpd_lightning.training.checkpoint_io import LAST, PREVIOUS, load_checkpoint
+
+FOLDER = "checkpoints"
+
+log = logging.getLogger(__name__)
+
+
+def find_resume(folder: str | Path) -> Path:
+    """Return the newest good checkpoint of a run folder (or of its checkpoint folder, or the given file itself).
+
+    Where ``last.ckpt`` is damaged, warns and returns the one before it. Raises CheckpointError where none is good.
+    """
+    folder = Path(folder)
+    if folder.is_file():
+        load_checkpoint(folder)
+        return folder
+    inside = folder / FOLDER if (folder / FOLDER).is_dir() else folder
+    candidates = [inside / name for name in (LAST, PREVIOUS) if (inside / name).is_file()]
+    if not candidates:
+        raise CheckpointError(
+            f"{folder} holds no checkpoint to go on from.\n"
+            "Give the folder of a run that saved one (checkpoints/last.ckpt), or train without resume."
+        )
+    first_error: CheckpointError | None = None
+    for path in candidates:
+        try:
+            load_checkpoint(path)
+        except CheckpointError as error:
+            first_error = first_error or error
+            continue
+        if first_error is not None:
+            log.warning("%s Going on from the checkpoint before it, %s.", str(first_error).splitlines()[0], path.name)
+        return path
+    assert first_error is not None
+    raise first_error
+
+
+def latest_run(experiment_folder: str | Path) -> Path:
+    """Return the run below a folder whose ``last.ckpt`` was written last; CheckpointError where there is none."""
+    experiment_folder = Path(experiment_folder)
+    found = [
+        (path.stat().st_mtime, path.parent.parent)
+        for name in (LAST, PREVIOUS)
+        for path in experiment_folder.glob(f"*/{FOLDER}/{name}")
+    ]
+    if not found:
+        raise CheckpointError(
+            f"No run below {experiment_folder} has saved a checkpoint yet.\nTrain without resume=last."
+        )
+    return max(found)[1]

@@ -1,0 +1,168 @@
+"""The training of a simulator as a LightningModule: which parts are called when, and what is logged. No maths."""
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor, nn
+
+from vpd_lightning.data.validation import VideoClip
+from vpd_lightning.errors import ConfigError, NonFiniteError
+from vpd_lightning.losses.base import AbstractLoss
+from vpd_lightning.metrics.psnr import mean_squared_error, psnr, psnr_of
+from vpd_lightning.training.optimization import AbstractOptimization
+from vpd_lightning.types import VideoBatch
+
+BEST_METRIC = "validation/psnr"
+
+
+class VPDModule(pl.LightningModule):
+    """Trains ``simulator`` on the weighted sum of ``losses``.
+
+    ``config`` is the resolved configuration as plain containers; it is stored in every checkpoint, as its
+    ``hyper_parameters``, and is what a model is rebuilt from.
+
+    After each step, ``train_metrics`` holds what is to be logged: loss, loss/<name>, psnr (training rays), lr,
+    gradient_norm, rays_per_second, uncovered_share (where the dynamics measures it).
+    """
+
+    def __init__(
+        self,
+        *,
+        simulator: nn.Module,
+        losses: Sequence[AbstractLoss],
+        optimization: AbstractOptimization,
+        config: Mapping[str, Any],
+    ) -> None:
+        super().__init__()
+        if not losses:
+            raise ConfigError("There is no loss to train on.\nSet loss=pixel, or another option of conf/loss.")
+        names = [loss.name for loss in losses]
+        if len(set(names)) != len(names):
+            raise ConfigError(f"Two losses have the same name: {', '.join(names)}.\nGive each its own name.")
+        _require_plain(config, "config")
+        self.save_hyperparameters(dict(config), logger=False)
+        self.simulator = simulator
+        self.losses = nn.ModuleList(losses)
+        self.optimization = optimization
+        self.train_metrics: dict[str, Tensor | float] = {}
+        self._clips: Sequence[str] = ()
+        self.seconds_per_step: float | None = None
+        self._last_start: float | None = None
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """Build the optimiser for ``trainer.max_steps`` updates; its schedule moves with every update."""
+        optimizer, schedule = self.optimization.build(self.simulator, self.trainer.max_steps)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    # -- training ------------------------------------------------------------------------------------------------------
+
+    def training_step(self, batch: VideoBatch, batch_idx: int) -> Tensor:
+        """Return the weighted sum of all losses; NonFiniteError before anything is updated by a bad one."""
+        self._clips = batch.clips
+        self._time_step()
+        batch = batch.to(self._parameter_dtype())
+        output = self.simulator(batch)
+        parts = {loss.name: loss(output, batch) for loss in self.losses}  # type: ignore[union-attr]
+        total = torch.stack([loss.weight * parts[loss.name] for loss in self.losses]).sum()  # type: ignore[union-attr]
+        if not torch.isfinite(total):
+            values = ", ".join(f"{name} = {part.item()}" for name, part in parts.items())
+            raise self._non_finite(f"The loss is not finite ({values})")
+        self.train_metrics = {
+            "loss": total.detach(),
+            **{f"loss/{name}": part.detach() for name, part in parts.items()},
+            "psnr": psnr_of(mean_squared_error(output.rendered.rgbs.detach().float(), batch.rgbs.float())).mean(),
+        }
+        if self.seconds_per_step is not None:
+            rays = batch.rgbs.shape[:-1].numel() * self.trainer.world_size
+            self.train_metrics["rays_per_second"] = rays / self.seconds_per_step
+        uncovered = getattr(self.simulator.dynamics, "last_uncovered_share", None)
+        if uncovered is not None:
+            self.train_metrics["uncovered_share"] = uncovered
+        return total
+
+    def _parameter_dtype(self) -> torch.dtype:
+        """Return the precision of the parameters, which the data follow (float32 under autocast, too)."""
+        return next(self.simulator.parameters()).dtype
+
+    def _time_step(self) -> None:
+        """Measure from the start of one step to the start of the next, data and optimiser included; a running mean."""
+        now, last = time.perf_counter(), self._last_start
+        self._last_start = now
+        if last is not None:
+            before = self.seconds_per_step
+            self.seconds_per_step = now - last if before is None else 0.9 * before + 0.1 * (now - last)
+
+    def on_validation_start(self) -> None:
+        """Leave validations out of the time of a training step."""
+        self._last_start = None
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Stop before a gradient that is not finite reaches the weights."""
+        self.train_metrics.update(_learning_rates(optimizer))
+        named = [(name, p.grad) for name, p in self.simulator.named_parameters() if p.grad is not None]
+        if not named:
+            return
+        norms = torch.stack(torch._foreach_norm([gradient for _, gradient in named]))
+        total = torch.linalg.vector_norm(norms)
+        # float16 training skips such steps itself, by its loss scaler.
+        has_scaler = getattr(self.trainer.precision_plugin, "scaler", None) is not None
+        if not torch.isfinite(total) and not has_scaler:
+            bad = [name for (name, _), norm in zip(named, norms, strict=True) if not torch.isfinite(norm)]
+            raise self._non_finite(f"The gradient of {len(bad)} parameters is not finite, first {(bad or ['?'])[0]}")
+        self.train_metrics["gradient_norm"] = total
+
+    def _non_finite(self, what: str) -> NonFiniteError:
+        return NonFiniteError(
+            f"{what}, at step {self.global_step}.\n"
+            f"Clips (file@first frame): {', '.join(self._clips)}.\n"
+            "Nothing was updated. Check these files (vpd-data validate), lower optimizer.lr, or set"
+            " trainer.gradient_clip_val."
+        )
+
+    # -- validation ----------------------------------------------------------------------------------------------------
+
+    def validation_step(self, clip: VideoClip, batch_idx: int) -> dict[str, Any]:
+        """Roll one clip out and compare all its frames; returns the pictures for callbacks to draw."""
+        clip = clip.to(self._parameter_dtype())
+        context, target = clip.context, clip.target
+        scene = self.simulator.encode(context.rgb, context.depth, context.cameras)  # type: ignore[operator]
+        states = self.simulator.rollout(scene, target.rgb.shape[0])  # type: ignore[operator]
+        frames = [
+            self.simulator.render([state], target.cameras[step])  # type: ignore[operator]
+            for step, state in enumerate(states)
+        ]
+        prediction = torch.cat(frames).float()
+        values = psnr(prediction, target.rgb.float() / 255.0)
+        if not torch.isfinite(prediction).all():
+            raise NonFiniteError(
+                f"The prediction for {clip.name} is not finite, after step {self.global_step}.\n"
+                "Lower optimizer.lr or set trainer.gradient_clip_val."
+            )
+        metrics = {BEST_METRIC: values.mean(), "validation/psnr_last_step": values[-1].mean()}
+        # Averages over clips, each counted once on whatever device it was.
+        self.log_dict(metrics, on_step=False, on_epoch=True, sync_dist=True, batch_size=1, logger=False)
+        return {"prediction": prediction, "psnr": values}
+
+
+def _learning_rates(optimizer: torch.optim.Optimizer) -> dict[str, Tensor | float]:
+    rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
+    if len(set(rates.values())) == 1:
+        return {"lr": next(iter(rates.values()))}
+    return {f"lr/{name}": rate for name, rate in rates.items()}
+
+
+def _require_plain(value: Any, where: str) -> None:
+    """Refuse what a safe load of the checkpoint would refuse."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if not isinstance(key, str | int | float | bool):
+                raise TypeError(f"{where} has a key of type {type(key).__name__}; keys must be plain")
+            _require_plain(item, f"{where}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            _require_plain(item, f"{where}[{index}]")
+    elif value is not None and type(value) not in (str, int, float, bool):
+        raise TypeError(f"{where} is a {type(value).__name__}; a checkpoint holds plain dicts, lists and scalars only")

@@ -1,0 +1,101 @@
+"""Adam and its learning rate over the training, as plain settings that a configuration holds."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import nn
+from torch.optim.lr_scheduler import LambdaLR
+
+
+class AbstractOptimization(ABC):
+    """Adam with one learning rate per stage, all multiplied by ``share_at(step)``."""
+
+    def __init__(
+        self, *, lr: float, betas: Sequence[float], eps: float, stage_multipliers: Mapping[str, float]
+    ) -> None:
+        if lr <= 0 or eps <= 0:
+            raise ValueError(f"lr and eps must be above 0, got lr={lr}, eps={eps}")
+        if len(betas) != 2 or not all(0.0 <= beta < 1.0 for beta in betas):
+            raise ValueError(f"betas must be two numbers in [0, 1), got {list(betas)}")
+        if any(value < 0 for value in stage_multipliers.values()):
+            raise ValueError(f"stage_multipliers must not be negative, got {dict(stage_multipliers)}")
+        self.lr, self.betas, self.eps = lr, (float(betas[0]), float(betas[1])), eps
+        self.stage_multipliers = dict(stage_multipliers)
+
+    @abstractmethod
+    def share_at(self, step: int, max_steps: int) -> float:
+        """Return the factor on all learning rates for the update that follows ``step`` updates."""
+
+    def build(self, simulator: nn.Module, max_steps: int) -> tuple[torch.optim.Adam, LambdaLR]:
+        """Return the optimiser and its schedule, to be stepped after every update.
+
+        Stages are the direct children of the simulator; a stage without a multiplier has 1. Raises ValueError where a
+        multiplier names no stage.
+        """
+        stages = dict(simulator.named_children())
+        unknown = sorted(set(self.stage_multipliers) - set(stages))
+        if unknown:
+            raise ValueError(f"stage_multipliers name {unknown[0]!r}, but the stages are {', '.join(stages)}")
+        groups: list[dict[str, Any]] = []
+        seen: set[int] = set()
+        for name, stage in [*stages.items(), ("simulator", simulator)]:
+            parameters = [p for p in stage.parameters() if p.requires_grad and id(p) not in seen]
+            seen.update(map(id, parameters))
+            if parameters:
+                rate = self.lr * self.stage_multipliers.get(name, 1.0)
+                groups.append({"params": parameters, "lr": rate, "name": name})
+        optimizer = torch.optim.Adam(groups, betas=self.betas, eps=self.eps)
+        # A plain function: a scheduler writes the attributes of other callables into the checkpoint.
+        return optimizer, LambdaLR(optimizer, lambda step: self.share_at(step, max_steps))
+
+
+class StepDecayAdam(AbstractOptimization):
+    """The learning rate is multiplied by ``gamma`` at each milestone (steps).
+
+    Paper section A.2: 1/3 at 100K and 300K.
+    """
+
+    def __init__(
+        self, *, lr: float, betas: Sequence[float], eps: float, milestones: Sequence[int], gamma: float
+    ) -> None:
+        super().__init__(lr=lr, betas=betas, eps=eps, stage_multipliers={})
+        if gamma <= 0 or any(milestone < 1 for milestone in milestones):
+            raise ValueError(f"gamma must be above 0 and milestones at least 1, got {gamma} and {list(milestones)}")
+        self.milestones, self.gamma = sorted(milestones), gamma
+
+    def share_at(self, step: int, max_steps: int) -> float:
+        """Return gamma to the power of the milestones passed."""
+        return self.gamma ** sum(step >= milestone for milestone in self.milestones)
+
+
+class WarmupCosineAdam(AbstractOptimization):
+    """Linear warm-up over ``warmup_steps``, then half a cosine down to ``final_share`` at the last step.
+
+    # Paper: steps down twice over 400K updates; a short training needs a smooth decay.
+    """
+
+    def __init__(
+        self,
+        *,
+        lr: float,
+        betas: Sequence[float],
+        eps: float,
+        stage_multipliers: Mapping[str, float],
+        warmup_steps: int,
+        final_share: float,
+    ) -> None:
+        super().__init__(lr=lr, betas=betas, eps=eps, stage_multipliers=stage_multipliers)
+        if warmup_steps < 0 or not 0.0 <= final_share <= 1.0:
+            raise ValueError(
+                f"warmup_steps must be at least 0 and final_share in [0, 1], got {warmup_steps} and {final_share}"
+            )
+        self.warmup_steps, self.final_share = warmup_steps, final_share
+
+    def share_at(self, step: int, max_steps: int) -> float:
+        """Return min(1, (step + 1) / warm-up) times the cosine from 1 to ``final_share``."""
+        warm_up = min(1.0, (step + 1) / self.warmup_steps) if self.warmup_steps else 1.0
+        done = min(1.0, max(0.0, (step - self.warmup_steps) / max(1, max_steps - self.warmup_steps)))
+        return warm_up * (self.final_share + (1.0 - self.final_share) * 0.5 * (1.0 + math.cos(math.pi * done)))
