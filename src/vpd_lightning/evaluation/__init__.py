@@ -1,0 +1,1 @@
+"""How good is a trained simulator: the held-out protocol, its references, motion against ground truth, and reports."""

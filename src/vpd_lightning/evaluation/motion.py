@@ -1,0 +1,124 @@
+"""Predicted particles against ground truth: the metric alone knows the true poses, the model never does."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from vpd_lightning.evaluation.protocol import Clip
+from vpd_lightning.geometry.cameras import unproject
+from vpd_lightning.geometry.workspace import inside_workspace
+from vpd_lightning.metrics.chamfer import ChamferDistance, chamfer
+from vpd_lightning.metrics.rigid_motion import (
+    centroid_error,
+    inside_box,
+    move_with_body,
+    particle_error,
+    rigidity_error,
+    rms_radius,
+)
+from vpd_lightning.types import Particles
+
+MIN_BODY_PARTICLES = 5
+PREDICTION_METRICS = ("centroid_error", "particle_error", "rigidity_error", "size_ratio", "lowest_point")
+REFERENCE_METRICS = ("centroid_error_constant", "centroid_error_copy", "particle_error_copy")
+MOTION_METRICS = (*PREDICTION_METRICS, *REFERENCE_METRICS)
+
+
+def valid_positions(particles: Particles) -> Float[Tensor, "particle 3"]:
+    """Positions of the particles that are there, in float64 on the CPU (batch axis of 1 or none)."""
+    positions, mask = particles.positions, particles.mask
+    if positions.dim() == 3:
+        positions, mask = positions[0], mask[0]
+    return positions[mask].detach().to("cpu", torch.float64)
+
+
+def trajectory_of(current: Particles, states: Sequence[Particles]) -> Float[Tensor, "time particle 3"]:
+    """Positions over time, the last observed ones first; particle i keeps its index through a rollout."""
+    return torch.stack([valid_positions(state) for state in (current, *states)])
+
+
+def body_masks(clip: Clip, positions: Float[Tensor, "particle 3"], margin: float) -> Bool[Tensor, "object particle"]:
+    """Which observed particles belong to which object: those inside its true box (grown by ``margin``) at that time."""
+    assert clip.state is not None
+    poses = clip.poses(0)[0]
+    half_sizes = torch.from_numpy(clip.state.half_sizes)
+    return torch.stack(
+        [inside_box(positions, pose, half, margin) for pose, half in zip(poses, half_sizes, strict=True)]
+    )
+
+
+def body_motion(
+    positions: Float[Tensor, "time particle 3"],
+    poses: Float[Tensor, "true_time 7"],
+    constant: Float[Tensor, "step 3"] | None,
+) -> dict[str, Float[Tensor, " step"]]:
+    """Judge the particles of one body (``positions``, observed first) against its true poses (observed first).
+
+    True motion carries the same particles rigidly by the change of pose. Values are metres, but for the size ratio.
+    Steps beyond the recording have no error (NaN), only the values that need no truth; a prediction that is not finite
+    has no value at all. ``constant`` is the mean
+    displacement of the training set, the reference that knows no input; "copy" predicts that nothing moves.
+    """
+    start, pred = positions[0], positions[1:]
+    finite = torch.isfinite(pred).all(-1).all(-1)
+    pred = torch.where(finite[:, None, None], pred, start)
+    num_steps, num_true = pred.shape[0], min(pred.shape[0], poses.shape[0] - 1)
+    values = {name: torch.full((num_steps,), torch.nan, dtype=torch.float64) for name in MOTION_METRICS}
+    values["rigidity_error"] = rigidity_error(pred, start)
+    values["size_ratio"] = rms_radius(pred) / rms_radius(start)
+    values["lowest_point"] = pred[..., 2].amin(-1)
+    if num_true > 0:
+        true = move_with_body(start, poses[0], poses[1 : num_true + 1])
+        still = start.expand_as(true)
+        values["centroid_error"][:num_true] = centroid_error(pred[:num_true], true)
+        values["particle_error"][:num_true] = particle_error(pred[:num_true], true)
+        values["centroid_error_copy"][:num_true] = centroid_error(still, true)
+        values["particle_error_copy"][:num_true] = particle_error(still, true)
+        if constant is not None:
+            num_known = min(num_true, constant.shape[0])
+            moved = still[:num_known] + constant[:num_known, None]
+            values["centroid_error_constant"][:num_known] = centroid_error(moved, true[:num_known])
+    for name in PREDICTION_METRICS:
+        values[name][~finite] = torch.nan
+    return values
+
+
+def clip_motion(
+    clip: Clip,
+    positions: Float[Tensor, "time particle 3"],
+    margin: float,
+    constants: Float[Tensor, "step object 3"] | None,
+) -> tuple[dict[str, Float[Tensor, "object step"]], Bool[Tensor, "object particle"]]:
+    """Judge every object of a clip; NaN for an object that the particles hardly show (fewer than 5 of them)."""
+    masks = body_masks(clip, positions[0], margin)
+    num_steps = positions.shape[0] - 1
+    poses = clip.poses(num_steps)
+    rows = []
+    for index, mask in enumerate(masks):
+        constant = None if constants is None or index >= constants.shape[1] else constants[:, index]
+        if mask.sum() >= MIN_BODY_PARTICLES:
+            rows.append(body_motion(positions[:, mask], poses[:, index], constant))
+        else:
+            missing = torch.full((num_steps,), torch.nan, dtype=torch.float64)
+            rows.append(dict.fromkeys(MOTION_METRICS, missing))
+    return {name: torch.stack([row[name] for row in rows]) for name in MOTION_METRICS}, masks
+
+
+def chamfer_to_depth(clip: Clip, step: int, pred: Float[Tensor, "particle 3"], max_points: int) -> ChamferDistance:
+    """Chamfer distance from particles to the true surface: the unprojected depth of all cameras inside the workspace.
+
+    At most ``max_points`` true points count, taken evenly over the pixels. Particles see the input views only, so the
+    completeness of a model with few input views contains what those cannot see.
+    """
+    if not bool(torch.isfinite(pred).all()):
+        return ChamferDistance(float("nan"), float("nan"))
+    depth = clip.target_depth[step]
+    points = unproject(depth, clip.target_cameras[step])
+    seen = torch.isfinite(depth) & (depth > 0)
+    points = points[seen]
+    points = points[inside_workspace(points, clip.workspace_min, clip.workspace_max)]
+    if points.shape[0] > max_points:
+        points = points[torch.linspace(0, points.shape[0] - 1, max_points).long()]
+    return chamfer(pred, points)

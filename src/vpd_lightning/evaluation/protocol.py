@@ -1,0 +1,142 @@
+"""What an evaluation asks for, and one held-out clip as it is read from disk."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vpd_lightning.data.ground_truth import GroundTruth, has_state, read_state
+from vpd_lightning.data.manifest import SPLITS
+from vpd_lightning.data.reader import TrajectoryReader
+from vpd_lightning.errors import ConfigError, DataError
+from vpd_lightning.types import Cameras
+
+NUM_CONTEXT = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol:
+    """Which clips are predicted, how far, and what the metrics count. Frames are counted from 0.
+
+    A clip that starts at frame ``s`` shows the model frames ``s`` and ``s + 1`` and asks for the ``num_steps`` frames
+    behind them. ``num_trajectories`` limits the split to its first files (None: all). ``num_long_steps`` (0: none)
+    rolls the clips of ``long_start_frame`` out further, without images. ``moving_threshold`` is a colour difference in
+    [0, 1], used where there is no segmentation; images with fewer than ``min_moving_pixels`` have no moving PSNR.
+    ``body_margin`` (metres) grows a body's true box when its particles are picked.
+    """
+
+    split: str
+    start_frames: Sequence[int]
+    num_steps: int
+    num_trajectories: int | None
+    num_long_steps: int
+    long_start_frame: int
+    moving_threshold: float
+    min_moving_pixels: int
+    body_margin: float
+    num_chamfer_points: int
+    num_bootstrap: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "start_frames", tuple(self.start_frames))
+        if self.split not in SPLITS:
+            raise ConfigError(f"There is no split {self.split!r}.\nAllowed: {', '.join(SPLITS)}.")
+        if not self.start_frames or min(self.start_frames) < 0 or len(set(self.start_frames)) < len(self.start_frames):
+            raise ConfigError(
+                f"start_frames is {list(self.start_frames)}; it must be a list of different frames, 0 or more."
+            )
+        if self.num_trajectories is not None and self.num_trajectories < 1:
+            raise ConfigError(f"num_trajectories is {self.num_trajectories}; it must be null or at least 1.")
+        for name, lowest in (("num_steps", 1), ("num_long_steps", 0), ("long_start_frame", 0), ("num_bootstrap", 1)):
+            if getattr(self, name) < lowest:
+                raise ConfigError(f"{name} is {getattr(self, name)}; it must be at least {lowest}.")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for ``metrics.json``."""
+        return {**asdict(self), "start_frames": list(self.start_frames)}
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Two context frames and the frames to predict, all cameras; colours are uint8, depth is metres of z-depth.
+
+    ``cameras`` holds those of the context (axes ``time=2 view``), ``target_cameras`` those of the predicted frames.
+    """
+
+    name: str
+    trajectory: int
+    start: int
+    rgb: UInt8[Tensor, "time view height width 3"]
+    depth: Float[Tensor, "time view height width"]
+    cameras: Cameras
+    target_rgb: UInt8[Tensor, "step view height width 3"]
+    target_depth: Float[Tensor, "step view height width"]
+    target_cameras: Cameras
+    workspace_min: tuple[float, float, float]
+    workspace_max: tuple[float, float, float]
+    frame_time: float
+    state: GroundTruth | None
+
+    @property
+    def current_frame(self) -> int:
+        """The last input frame; predicted step ``h`` (from 0) is frame ``current_frame + 1 + h``."""
+        return self.start + NUM_CONTEXT - 1
+
+    def poses(self, num_steps: int) -> Float[Tensor, "time object 7"]:
+        """True poses from the last input frame on, at most ``num_steps`` steps (fewer where the recording ends)."""
+        assert self.state is not None
+        window = slice(self.current_frame, self.current_frame + num_steps + 1)
+        poses = np.concatenate([self.state.positions[window], self.state.quaternions[window]], axis=-1)
+        return torch.from_numpy(poses)
+
+
+def read_cameras(reader: TrajectoryReader, times: Sequence[int], views: Sequence[int]) -> Cameras:
+    """Return the cameras of some frames and views (axes ``time view``) in float32."""
+    intrinsics, cam_to_world = reader.cameras(times, views)
+    return Cameras(_float32(intrinsics), _float32(cam_to_world), reader.height, reader.width)
+
+
+def read_clip(path: Path, trajectory: int, start: int, num_steps: int, with_state: bool = True) -> Clip:
+    """Read one clip of a trajectory; ``DataError`` where the recording is too short for it."""
+    with TrajectoryReader(path) as reader:
+        last = start + NUM_CONTEXT + num_steps - 1
+        if last >= reader.num_frames:
+            raise DataError(
+                f"{path} has {reader.num_frames} frames; start frame {start} with {num_steps} steps needs "
+                f"{last + 1}.\nLower num_steps to {max(reader.num_frames - start - NUM_CONTEXT, 0)} or fewer, or start "
+                "earlier."
+            )
+        views = range(reader.num_views)
+        context, targets = range(start, start + NUM_CONTEXT), range(start + NUM_CONTEXT, last + 1)
+        return Clip(
+            name=f"{path.parent.name}/{path.name}@{start}",
+            trajectory=trajectory,
+            start=start,
+            rgb=torch.from_numpy(reader.rgb(context, views)),
+            depth=torch.from_numpy(reader.depth(context, views)),
+            cameras=read_cameras(reader, context, views),
+            target_rgb=torch.from_numpy(reader.rgb(targets, views)),
+            target_depth=torch.from_numpy(reader.depth(targets, views)),
+            target_cameras=read_cameras(reader, targets, views),
+            workspace_min=reader.workspace_min,
+            workspace_max=reader.workspace_max,
+            frame_time=reader.frame_time,
+            state=read_state(path) if with_state and has_state(path) else None,
+        )
+
+
+def read_clips(paths: Sequence[Path], protocol: Protocol) -> Iterator[Clip]:
+    """Read the clips of the protocol one after the other: every start frame of the first trajectory, then the next."""
+    for trajectory, path in enumerate(paths[: protocol.num_trajectories]):
+        for start in protocol.start_frames:
+            yield read_clip(path, trajectory, start, protocol.num_steps)
+
+
+def _float32(array: NDArray[np.float64]) -> Tensor:
+    return torch.from_numpy(array.astype(np.float32))

@@ -1,0 +1,1 @@
+"""What leaves the program: videos, pictures, and particle files that other programs open."""

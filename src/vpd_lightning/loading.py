@@ -1,0 +1,95 @@
+"""From a checkpoint to a simulator that predicts: ``vpd_lightning.load``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vpd_lightning.errors import CheckpointError, ConfigError
+from vpd_lightning.simulator import Simulator
+
+_PREFIX = "simulator."
+
+
+@dataclass(frozen=True)
+class LoadedModel:
+    """A trained simulator in evaluation mode, the plain configuration it was built from, and the file it came from."""
+
+    simulator: Simulator
+    config: dict[str, Any]
+    path: Path
+    step: int
+
+    @property
+    def input_views(self) -> list[int]:
+        """The cameras that the encoder looks through."""
+        return list(self.config["scene"]["input_views"])
+
+    @property
+    def name(self) -> str:
+        """The experiment that trained it."""
+        return str(self.config.get("experiment", "custom"))
+
+
+def load(path: str | Path, device: str | torch.device = "cpu") -> Simulator:
+    """Load the simulator of a checkpoint (or of a run folder: its newest good checkpoint).
+
+    Only plain tensors and a plain configuration are read, and the configuration is checked against the list of classes
+    that may be built, so a checkpoint from elsewhere cannot run code.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, not ours, or does not fit the model it describes.
+        ConfigError: there is no such device.
+    """
+    return load_model(path, device).simulator
+
+
+def load_model(path: str | Path, device: str | torch.device = "cpu") -> LoadedModel:
+    """Load a simulator together with its configuration; see ``load``."""
+    # Imported here: importing the package must not need Hydra or Lightning.
+    from vpd_lightning.config import build_simulator
+    from vpd_lightning.training.checkpoint_io import load_checkpoint
+    from vpd_lightning.training.checkpoints import find_resume
+
+    target = find_device(device)
+    path = Path(path).expanduser()
+    if path.is_dir():
+        path = find_resume(path)
+    content = load_checkpoint(path)
+    config = content.get("hyper_parameters")
+    if not isinstance(config, dict) or not isinstance(config.get("scene"), dict):
+        raise CheckpointError(f"{path} does not say what model it holds (no hyper_parameters).\nUse one of vpd-train.")
+    try:
+        simulator = build_simulator(config)
+    except ConfigError as error:
+        raise CheckpointError(
+            f"{path} describes a model that this version cannot build.\n{str(error).splitlines()[0]}"
+        ) from error
+    weights = {
+        name.removeprefix(_PREFIX): value for name, value in content["state_dict"].items() if name.startswith(_PREFIX)
+    }
+    try:
+        simulator.load_state_dict(weights)
+    except RuntimeError as error:
+        detail = " ".join(str(error).split())
+        raise CheckpointError(f"The weights in {path} do not fit the model it describes.\n{detail[:300]}") from error
+    step = content.get("global_step", 0)
+    return LoadedModel(simulator.to(target).eval(), config, path, step if isinstance(step, int) else 0)
+
+
+def find_device(device: str | torch.device) -> torch.device:
+    """Return a device that is there; ``auto`` is the GPU where there is one.
+
+    Raises:
+        ConfigError: the name means nothing, or the machine lacks it.
+    """
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        found = torch.device(device)
+        torch.empty(0, device=found)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"There is no device {str(device)!r}: {reason}\nUse device=cpu, or device=auto.") from error
+    return found

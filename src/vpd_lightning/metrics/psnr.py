@@ -1,0 +1,49 @@
+"""Peak signal-to-noise ratio, one value per image."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+PSNR_CAP = 100.0
+"""An identical pair has infinite PSNR; averages over images count it as this many dB (see ``psnr_of``)."""
+
+
+def mean_squared_error(
+    pred: Float[Tensor, "*image height width 3"],
+    target: Float[Tensor, "*image height width 3"],
+    mask: Bool[Tensor, "*image height width"] | None = None,
+) -> Float[Tensor, "*image"]:
+    """Mean over pixels (those of ``mask``) and channels; NaN for an image whose mask is empty.
+
+    The prediction is clamped to [0, 1] first, as a screen would.
+    """
+    squared = (pred.clamp(0.0, 1.0) - target).square().mean(-1)
+    if mask is None:
+        return squared.mean((-2, -1))
+    return (squared * mask).sum((-2, -1)) / mask.sum((-2, -1))
+
+
+def psnr_of(mse: Float[Tensor, "*image"]) -> Float[Tensor, "*image"]:
+    """Convert a mean squared error of values in [0, 1] to decibels, ``-10 log10(mse)``; infinite where it is 0."""
+    return -10.0 * torch.log10(mse)
+
+
+def psnr(
+    pred: Float[Tensor, "*image height width 3"], target: Float[Tensor, "*image height width 3"]
+) -> Float[Tensor, "*image"]:
+    """PSNR in dB of float images in [0, 1], one value per image; the prediction is clamped.
+
+    Identical images have an infinite PSNR.
+    """
+    return psnr_of(mean_squared_error(pred, target))
+
+
+def masked_psnr(
+    pred: Float[Tensor, "*image height width 3"],
+    target: Float[Tensor, "*image height width 3"],
+    mask: Bool[Tensor, "*image height width"],
+    min_pixels: int,
+) -> Float[Tensor, "*image"]:
+    """PSNR in dB over the pixels of ``mask``; NaN for images with fewer than ``min_pixels`` of them."""
+    values = psnr_of(mean_squared_error(pred, target, mask))
+    return torch.where(mask.sum((-2, -1)) >= min_pixels, values, torch.full_like(values, torch.nan))

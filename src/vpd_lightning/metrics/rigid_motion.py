@@ -1,0 +1,73 @@
+"""Motion of a rigid body's particles against its true poses. World frame, metres; quaternions are w x y z."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def rotation_matrix(quaternion: Float[Tensor, "*shape 4"]) -> Float[Tensor, "*shape 3 3"]:
+    """Rotation matrix of a quaternion (w x y z), normalised first."""
+    w, x, y, z = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def to_body_frame(points: Float[Tensor, "particle 3"], pose: Float[Tensor, " 7"]) -> Float[Tensor, "particle 3"]:
+    """Express world points in the frame of a body; ``pose`` is position then quaternion."""
+    return (points - pose[:3]) @ rotation_matrix(pose[3:])
+
+
+def to_world_frame(points: Float[Tensor, "particle 3"], pose: Float[Tensor, " 7"]) -> Float[Tensor, "particle 3"]:
+    """Express points of a body's frame in the world; the inverse of ``to_body_frame``."""
+    return points @ rotation_matrix(pose[3:]).T + pose[:3]
+
+
+def inside_box(
+    points: Float[Tensor, "particle 3"], pose: Float[Tensor, " 7"], half_size: Float[Tensor, " 3"], margin: float
+) -> Bool[Tensor, " particle"]:
+    """Which points lie in the oriented box grown by ``margin`` on every side."""
+    return (to_body_frame(points, pose).abs() <= half_size + margin).all(-1)
+
+
+def move_with_body(
+    points: Float[Tensor, "particle 3"], start: Float[Tensor, " 7"], poses: Float[Tensor, "step 7"]
+) -> Float[Tensor, "step particle 3"]:
+    """Where points fixed to a body at pose ``start`` are at each later pose."""
+    local = to_body_frame(points, start)
+    return torch.stack([to_world_frame(local, pose) for pose in poses])
+
+
+def centroid_error(
+    pred: Float[Tensor, "step particle 3"], true: Float[Tensor, "step particle 3"]
+) -> Float[Tensor, " step"]:
+    """Distance in metres between the centroids of corresponding particles, one value per step."""
+    return (pred.mean(1) - true.mean(1)).norm(dim=-1)
+
+
+def particle_error(
+    pred: Float[Tensor, "step particle 3"], true: Float[Tensor, "step particle 3"]
+) -> Float[Tensor, " step"]:
+    """Mean distance in metres between corresponding particles, one value per step."""
+    return (pred - true).norm(dim=-1).mean(-1)
+
+
+def rms_radius(points: Float[Tensor, "*shape particle 3"]) -> Float[Tensor, "*shape"]:
+    """Root mean square distance to the centroid in metres: a rigid motion leaves it alone."""
+    return (points - points.mean(-2, keepdim=True)).square().sum(-1).mean(-1).sqrt()
+
+
+def rigidity_error(
+    pred: Float[Tensor, "step particle 3"], start: Float[Tensor, "particle 3"]
+) -> Float[Tensor, " step"]:
+    """Root mean square residual in metres after the best rigid motion from ``start`` (Kabsch 1976) is taken out."""
+    centred = start - start.mean(0)
+    target = pred - pred.mean(1, keepdim=True)
+    u, _, vh = torch.linalg.svd(torch.einsum("pi,spj->sij", centred, target))
+    sign = torch.ones_like(u[..., 0, :])
+    sign[..., -1] = torch.det(u @ vh).sign()
+    rotation = (u * sign.unsqueeze(-2)) @ vh
+    return (target - torch.einsum("pi,sij->spj", centred, rotation)).square().sum(-1).mean(-1).sqrt()

@@ -1,0 +1,113 @@
+"""``vpd-eval`` from its words to its files, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.evaluation.tossed_box import write_tossed_boxes
+from tests.evaluation.untrained_model import write_untrained
+from vpd_lightning.commands.eval import choose_protocol, main
+from vpd_lightning.errors import ConfigError
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tossed_boxes(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path, data: Path) -> Path:
+    return write_untrained(tmp_path / "run", data)
+
+
+def test_an_evaluation_writes_everything_and_prints_its_path_last(
+    checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([f"ckpt={checkpoint}", "num_videos=1", "protocol.num_trajectories=1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    folder = checkpoint.parents[1] / "evaluation"
+    assert lines[-1] == str(folder / "metrics.json")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "arrays.npz",
+        "contact_sheet.png",
+        "curves.png",
+        "metrics.csv",
+        "metrics.json",
+        "videos",
+    ]
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["step"] == 7 and len(metrics["checkpoint_sha256"]) == len(metrics["data_sha256"]) == 64
+    assert metrics["protocol"]["num_steps"] == 3, "the run's own protocol"
+    # Nothing moves in this model, so it is as wrong as predicting no motion.
+    assert metrics["motion"]["centroid_error_over_copy"]["per_step"] == pytest.approx([1.0] * 3)
+    assert metrics["long_rollout"]["num_steps"] == 20
+
+
+def test_a_second_evaluation_does_not_overwrite_the_first(checkpoint: Path) -> None:
+    words = [
+        f"ckpt={checkpoint.parents[1]}",
+        "num_videos=0",
+        "protocol.num_trajectories=1",
+        "protocol.num_long_steps=0",
+    ]
+    assert main(words) == main(words) == 0
+    run = checkpoint.parents[1]
+    first, second = (json.loads((run / name / "metrics.json").read_text()) for name in ("evaluation", "evaluation_2"))
+    assert first["psnr"] == second["psnr"], "an evaluation repeats exactly"
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["protocol.split=tests"], 2, "no split 'tests'"),
+        (["protocol.split=validation"], 3, "split 'validation'"),
+        (["protocol.num_steps=60"], 3, "num_steps"),
+        (["protocol.num_step=6"], 2, "num_step"),
+        (["num_videos=-1"], 2, "num_videos=-1"),
+        (["num_threads=0"], 2, "num_threads=0"),
+        (["device=tpu9"], 2, "device"),
+        (["data.folder=nowhere"], 3, "vpd-data generate"),
+        (["out={folder}"], 2, "exists already"),
+    ],
+)
+def test_bad_words_get_a_named_error(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, message: str
+) -> None:
+    words = [word.format(folder=tmp_path) for word in words]
+    assert main([f"ckpt={checkpoint}", "num_videos=0", *words]) == code
+    error = capsys.readouterr().err
+    assert message in error and len(error.strip().splitlines()) <= 5
+    assert [path.name for path in checkpoint.parents[1].iterdir()] == ["checkpoints"], "nothing stays behind"
+
+
+def test_a_missing_checkpoint_is_a_checkpoint_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([f"ckpt={tmp_path}/none.ckpt"]) == 4
+    assert "There is no checkpoint" in capsys.readouterr().err
+
+
+def test_wrong_input_views_are_refused(tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint = write_untrained(tmp_path / "run", data, "scene.input_views=[0,5]")
+    assert main([f"ckpt={checkpoint}", "num_videos=0"]) == 2
+    assert "reads views [0, 5]" in capsys.readouterr().err
+
+
+PROTOCOL = {
+    "split": "test", "start_frames": [4], "num_steps": 8, "num_trajectories": 16, "num_long_steps": 0,
+    "long_start_frame": 0, "moving_threshold": 0.1, "min_moving_pixels": 10, "body_margin": 0.02,
+    "num_chamfer_points": 100, "num_bootstrap": 10,
+}  # fmt: skip
+
+
+def test_a_value_that_is_set_replaces_that_of_the_run() -> None:
+    protocol = choose_protocol({**dict.fromkeys(PROTOCOL), "num_steps": 2}, PROTOCOL)
+    assert protocol.num_steps == 2 and protocol.num_trajectories == 16
+
+
+def test_a_whole_protocol_takes_nothing_from_the_run() -> None:
+    assert choose_protocol({**PROTOCOL, "num_trajectories": None}, PROTOCOL).num_trajectories is None
+
+
+def test_a_run_without_protocol_needs_one() -> None:
+    with pytest.raises(ConfigError, match="protocol=paper"):
+        choose_protocol(dict.fromkeys(PROTOCOL), None)
