@@ -1,4 +1,4 @@
-"""All randomness comes from (seed, step, index of the sample in the global batch, purpose); nothing draws from global state.
+"""All randomness comes from (seed, step, index of the sample in the global batch, purpose), none from global state.
 
 This is what makes a resumed run bitwise equal to an uninterrupted one, and independent of loader workers and ranks.
 """

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -16,6 +16,10 @@ Border = TypeVar("Border", bound="_Border")
 def _moved(value: Any, *args: Any, **kwargs: Any) -> Any:
     """Move tensors and border dataclasses; leave plain values alone. A dtype touches floating tensors only."""
     return value.to(*args, **kwargs) if isinstance(value, (Tensor, _Border)) else value
+
+
+# None may be given; readers always find a tensor (see Particles.__post_init__), and the type checker is told so.
+_Mask: TypeAlias = Tensor if TYPE_CHECKING else Bool[Tensor, "*batch particle"] | None  # type: ignore[valid-type]
 
 
 class _Border:
@@ -83,7 +87,7 @@ class Particles(_Border):
 
     positions: Float[Tensor, "*batch particle 3"]
     features: Float[Tensor, "*batch particle feature"]
-    mask: Bool[Tensor, "*batch particle"] = None  # type: ignore[assignment]
+    mask: _Mask = None  # type: ignore[assignment]
     colors: Float[Tensor, "*batch particle 3"] | None = None
     moving: Bool[Tensor, "*batch particle"] | None = None
     normals: Float[Tensor, "*batch particle 3"] | None = None

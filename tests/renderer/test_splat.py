@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from vpd_lightning.renderer.splat import SplatRenderer
+from vpd_lightning.renderer.splat import SplatRenderer, smallest
 from vpd_lightning.types import Particles, Rays
 
 SETTINGS = {
@@ -78,7 +78,9 @@ def test_moving_world_and_rays_together_leaves_the_picture_alone():
     model, scene, lines = renderer(), particles(), rays()
     shift = torch.tensor([5.0, -3.0, 2.0], dtype=torch.float64)
 
-    moved = model(Particles(scene.positions + shift, scene.features), Rays(lines.origins + shift, lines.directions), None)
+    moved = model(
+        Particles(scene.positions + shift, scene.features), Rays(lines.origins + shift, lines.directions), None
+    )
 
     assert torch.allclose(model(scene, lines, None).rgbs, moved.rgbs, atol=1e-9)
 
@@ -86,9 +88,7 @@ def test_moving_world_and_rays_together_leaves_the_picture_alone():
 def test_what_is_far_behind_the_first_surface_does_not_show():
     model, front = renderer(), particles(count=200)
     behind = Particles(front.positions - torch.tensor([0.0, 0.0, 6.0]), front.features.flip(1))
-    both = Particles(
-        torch.cat([front.positions, behind.positions], 1), torch.cat([front.features, behind.features], 1)
-    )
+    both = Particles(torch.cat([front.positions, behind.positions], 1), torch.cat([front.features, behind.features], 1))
     # a dense front: all candidates of a ray belong to it, wherever they lie beside the ray
     assert torch.allclose(model(front, rays(), None).rgbs, model(both, rays(), None).rgbs, atol=1e-6)
 
@@ -133,7 +133,9 @@ def test_every_parameter_receives_a_finite_gradient():
 
 def test_rays_through_a_particle_and_duplicates_stay_finite():
     scene = particles(batch=1, count=4)
-    same = Particles(scene.positions[:, :1].expand(1, 30, 3).clone().requires_grad_(), scene.features[:, :1].expand(1, 30, 5))
+    same = Particles(
+        scene.positions[:, :1].expand(1, 30, 3).clone().requires_grad_(), scene.features[:, :1].expand(1, 30, 5)
+    )
     direction = same.positions[:, :1].detach() - torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
     lines = Rays(torch.tensor([[[0.0, 0.0, 3.0]]], dtype=torch.float64), direction / direction.norm())
 
@@ -149,3 +151,14 @@ def test_rays_through_a_particle_and_duplicates_stay_finite():
 def test_wrong_settings_are_refused(changes):
     with pytest.raises(ValueError):
         renderer(**changes)
+
+
+@pytest.mark.parametrize(("num_particles", "count"), [(5, 8), (130, 8), (131, 8), (1280, 24), (1281, 24)])
+def test_grouped_selection_finds_the_smallest_scores(num_particles, count):
+    scores = torch.rand(33, num_particles).round(decimals=2)  # with ties
+
+    index = smallest(scores, count)
+
+    expected = scores.sort(dim=-1).values[:, :count]
+    assert torch.equal(torch.gather(scores, 1, index).sort(dim=-1).values, expected)
+    assert all(len(set(row.tolist())) == len(row) for row in index)

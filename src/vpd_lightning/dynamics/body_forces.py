@@ -25,7 +25,9 @@ class BodyForces(nn.Module):
         self.num_forces, self.scale, self.contact_range = num_forces, scale, contact_range
         self.encode_probe = _mlp(19, hidden_dim, hidden_dim)
         self.encode_anchor = _mlp(2 * hidden_dim + 7, hidden_dim, hidden_dim)
-        self.messages = nn.ModuleList(_mlp(2 * hidden_dim + 4, hidden_dim, hidden_dim) for _ in range(message_passing_steps))
+        self.messages = nn.ModuleList(
+            _mlp(2 * hidden_dim + 4, hidden_dim, hidden_dim) for _ in range(message_passing_steps)
+        )
         self.updates = nn.ModuleList(_mlp(2 * hidden_dim, hidden_dim, hidden_dim) for _ in range(message_passing_steps))
         self.probe_query = nn.Linear(hidden_dim, hidden_dim)
         self.anchor_query = nn.Linear(hidden_dim, hidden_dim, bias=False)

@@ -34,7 +34,9 @@ class InertialMemory:
     index: Int[Tensor, "batch moving"]  # slots of the moving candidates among all particles
     mask: Bool[Tensor, "batch moving"]
     displacements: Float[Tensor, "batch moving 3"]  # of the last step, exact from the second prediction on
-    fit_weights: Float[Tensor, "batch anchor moving"]  # rows sum to one: which particles an anchor's motion is fitted to
+    fit_weights: Float[
+        Tensor, "batch anchor moving"
+    ]  # rows sum to one: which particles an anchor's motion is fitted to
     centers: Float[Tensor, "batch anchor 3"]  # of the body an anchor belongs to; carried along as if it were a particle
     center_displacements: Float[Tensor, "batch anchor 3"]
     body_weights: Float[Tensor, "batch anchor moving"]  # rows sum to one, wider than fit_weights: whose mass it is
@@ -211,7 +213,7 @@ class InertialDynamics(AbstractDynamics):
 
     @staticmethod
     def _carried_twists(positions: Tensor, memory: InertialMemory) -> Twists:
-        """Continue the last displacement for one step of free motion: the body's centre moves straight, the spin stays."""
+        """Continue the last displacement in free motion: the body's centre moves straight, the spin stays."""
         fitted = fit_twists(positions, memory.displacements, memory.fit_weights)
         return Twists(memory.centers, memory.center_displacements, fitted.spins)
 
@@ -267,5 +269,3 @@ def _apply_twists(
     offsets = positions[:, None] - twists.centers[:, :, None]
     moved = (twists.centers + twists.displacements)[:, :, None] + rotate(rotations[:, :, None], offsets)
     return (blend[..., None] * moved).sum(dim=1)
-
-

@@ -204,4 +204,3 @@ def _kabsch(source: Tensor, goal: Tensor, weights: Tensor) -> tuple[Tensor, Tens
     flip[..., 2] = torch.sign(torch.linalg.det(u @ vt))
     rotation = (u * flip[..., None, :]) @ vt
     return rotation.to(source.dtype), source_center, goal_center
-

@@ -1,4 +1,4 @@
-"""Appearance changes caused by motion: a surface that turns in the light, a shadow that moves over what stands still."""
+"""Appearance changes caused by motion: a surface turns in the light, a shadow moves over what stands still."""
 
 from collections.abc import Sequence
 

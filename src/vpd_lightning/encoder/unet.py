@@ -103,7 +103,7 @@ class UNetEncoder(AbstractEncoder):
                 low, high = self.workspace_min, self.workspace_max
                 raise EmptyWorkspaceError(
                     f"no measured pixel of batch member {member} lies in the workspace {low} to {high}.\n"
-                    "Check depth units (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."
+                    "Check depth (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."
                 )
             if self.moving_fraction is None or moving is None:
                 index, valid = choose(allowed, self.num_particles, generator)

@@ -16,9 +16,7 @@ def pixel_centers(cameras: Cameras) -> Float[Tensor, "height width 2"]:
     return torch.stack([x, y], dim=-1)
 
 
-def _camera_directions(
-    cameras: Cameras, pixels: Float[Tensor, "*shape point 2"]
-) -> Float[Tensor, "*shape point 3"]:
+def _camera_directions(cameras: Cameras, pixels: Float[Tensor, "*shape point 2"]) -> Float[Tensor, "*shape point 3"]:
     """Return the point at z-depth 1 behind each pixel, in camera coordinates."""
     k = cameras.intrinsics[..., None, :, :]
     y = (pixels[..., 1] - k[..., 1, 2]) / k[..., 1, 1]
@@ -32,9 +30,7 @@ def _rotate(cam_to_world: Float[Tensor, "*camera 4 4"], vectors: Float[Tensor, "
     return (rotation * vectors[..., None, :]).sum(dim=-1)
 
 
-def unproject(
-    depth: Float[Tensor, "*shape height width"], cameras: Cameras
-) -> Float[Tensor, "*shape height width 3"]:
+def unproject(depth: Float[Tensor, "*shape height width"], cameras: Cameras) -> Float[Tensor, "*shape height width 3"]:
     """Lift every pixel to the world point at its z-depth (metres). Paper section 3.1.
 
     Pixels without a measurement (0 or non-finite depth) give points that mean nothing; mask them by the depth.
@@ -65,9 +61,7 @@ def project(
     local = (cam_to_world[..., :3, :3] * offset[..., :, None]).sum(dim=-2)  # inverse of a rotation is its transpose
     depth = local[..., 2]
     x, y = local[..., 0] / depth, local[..., 1] / depth
-    pixels = torch.stack(
-        [k[..., 0, 0] * x + k[..., 0, 1] * y + k[..., 0, 2], k[..., 1, 1] * y + k[..., 1, 2]], dim=-1
-    )
+    pixels = torch.stack([k[..., 0, 0] * x + k[..., 0, 1] * y + k[..., 0, 2], k[..., 1, 1] * y + k[..., 1, 2]], dim=-1)
     return pixels, depth
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from vpd_lightning.randomness import RandomKeys
@@ -60,7 +60,9 @@ class SplatRenderer(AbstractRenderer):
         """Render rays (``batch ray 3``); nothing here is random, so ``keys`` is not used."""
         num_rays = rays.origins.shape[1]
         chunks = [
-            self._render(particles, rays.origins[:, s : s + self.ray_chunk_size], rays.directions[:, s : s + self.ray_chunk_size])
+            self._render(
+                particles, rays.origins[:, s : s + self.ray_chunk_size], rays.directions[:, s : s + self.ray_chunk_size]
+            )
             for s in range(0, max(num_rays, 1), self.ray_chunk_size)
         ]
         rgbs, depths, opacities = (torch.cat(parts, dim=1) for parts in zip(*chunks, strict=True))
@@ -119,26 +121,70 @@ class SplatRenderer(AbstractRenderer):
             inputs.append(torch.log1p(membership.exp().sum(dim=-1, keepdim=True)))
         return torch.cat(inputs, dim=-1), torch.cat(depths, dim=-1)
 
-    def _candidates(self, particles: Particles, origins: Tensor, directions: Tensor) -> Int[Tensor, "batch ray candidate"]:
-        """Choose the particles closest to each ray; those behind the camera, hidden or padded come last.
-
-        The pairs (ray, particle) are the renderer's only quadratic part, so they are few passes over one array: two
-        matrix products give distance along and squared distance beside the ray. That loses digits, which may change
-        the last candidates; the chosen ones are measured anew without it.
-        """
+    def _candidates(
+        self, particles: Particles, origins: Tensor, directions: Tensor
+    ) -> Int[Tensor, "batch ray candidate"]:
+        """Choose the particles closest to each ray; those behind the camera, hidden or padded come last."""
         center = particles.positions.mean(dim=1, keepdim=True)
         positions, eyes = particles.positions - center, origins - center
-        ones = torch.ones_like(positions[..., :1])
-        square_norm = positions.square().sum(dim=-1, keepdim=True).masked_fill(~particles.mask[..., None], 1e9)
+        index = [
+            torch.cat(
+                [
+                    self._search(
+                        positions[m],
+                        particles.mask[m],
+                        eyes[m, s : s + _SEARCH_BLOCK],
+                        directions[m, s : s + _SEARCH_BLOCK],
+                    )
+                    for s in range(0, eyes.shape[1], _SEARCH_BLOCK)
+                ]
+            )
+            for m in range(len(positions))
+        ]
+        return torch.stack(index)
+
+    def _search(
+        self,
+        positions: Float[Tensor, "particle 3"],
+        mask: Bool[Tensor, " particle"],
+        eyes: Float[Tensor, "ray 3"],
+        directions: Float[Tensor, "ray 3"],
+    ) -> Int[Tensor, "ray candidate"]:
+        """Score all pairs of a block of rays and return the best particles of each ray.
+
+        The pairs are the renderer's only quadratic part, so they are few passes over one array that stays in cache:
+        two matrix products give distance along and squared distance beside the ray, conditions are sums of ramps. The
+        products lose digits, which may change the last candidates; the chosen ones are measured anew without them.
+        """
+        ones = torch.ones_like(positions[:, :1])
+        square_norm = positions.square().sum(dim=-1, keepdim=True) + 1e6 * ~mask[:, None]
         lines = torch.cat([directions, -(eyes * directions).sum(dim=-1, keepdim=True)], dim=-1)
         along = lines @ torch.cat([positions, ones], dim=-1).mT
-        points = torch.cat([-2 * eyes, torch.ones_like(eyes[..., :1]), eyes.square().sum(dim=-1, keepdim=True)], dim=-1)
+        points = torch.cat([-2 * eyes, torch.ones_like(eyes[:, :1]), eyes.square().sum(dim=-1, keepdim=True)], dim=-1)
         square = points @ torch.cat([positions, square_norm, ones], dim=-1).mT
         square.addcmul_(along, along, value=-1.0)
-        along.masked_fill_(along <= self.near, 2 * self.far)
-        beside = square > (0.5 * self.kernel_scales[-1]) ** 2
-        first = along.masked_fill(beside, self.far).amin(dim=-1, keepdim=True)
+        along.add_((self.near - along).clamp_(min=0), alpha=1e4)  # behind the camera counts as far away
+        beside = (square - (0.5 * self.kernel_scales[-1]) ** 2).clamp_(min=0)
+        first = torch.add(along, beside, alpha=1e4).amin(dim=-1, keepdim=True)
         behind = along.sub_(first + 3 * self.layer_depth).clamp_(min=0)
-        score = square.addcmul_(behind, behind, value=0.04)
-        count = min(self.num_candidates, particles.num_particles)
-        return score.topk(count, dim=-1, largest=False, sorted=False).indices
+        return smallest(square.addcmul_(behind, behind, value=0.04), self.num_candidates)
+
+
+_SEARCH_BLOCK = 256  # rays; 256 x 1,280 float32 scores are 1.3 MB
+
+
+def smallest(scores: Float[Tensor, "ray particle"], count: int) -> Int[Tensor, "ray candidate"]:
+    """Return the indices of the ``count`` smallest scores of each row, in no order; exact.
+
+    The smallest lie in the ``count`` groups of eight whose best is smallest: most scores only pass through a minimum.
+    """
+    num_rays, num_particles = scores.shape
+    count, group = min(count, num_particles), 8
+    if num_particles < 4 * count * group // 2:
+        return scores.topk(count, dim=-1, largest=False, sorted=False).indices
+    padding = -num_particles % group
+    groups = nn.functional.pad(scores, (0, padding), value=float("inf")).view(num_rays, -1, group)
+    best = groups.amin(dim=-1).topk(count, dim=-1, largest=False, sorted=False).indices
+    members = torch.gather(groups, 1, best[..., None].expand(-1, -1, group)).flatten(1)
+    chosen = members.topk(count, dim=-1, largest=False, sorted=False).indices
+    return torch.gather(best, 1, chosen // group) * group + chosen % group

@@ -1,0 +1,104 @@
+"""``resume=...``: which run to go on with, and with which settings."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+from vpd_lightning.errors import CheckpointError, ConfigError
+
+OVERRIDES_FILE = "overrides.yaml"
+
+
+def resumed_overrides(overrides: Sequence[str]) -> list[str]:
+    """Return the overrides of the run to go on with, followed by the new ones; without ``resume``, the given ones.
+
+    ``resume=FOLDER`` names a run folder, ``resume=last`` the youngest one (of the experiment, where one is given),
+    ``resume=auto`` goes on with ``run.folder`` where that holds a checkpoint and starts it otherwise.
+
+    Raises:
+        ConfigError: ``resume=auto`` without ``run.folder``.
+        CheckpointError: there is no run to resume, or its settings cannot be read.
+    """
+    given = _as_mapping(overrides)
+    wanted = _unquote(given.get("resume", "null"))
+    if wanted in ("null", ""):
+        return list(overrides)
+    if wanted == "auto":
+        if "run.folder" not in given:
+            raise ConfigError("resume=auto needs to know the folder.\nAdd run.folder=FOLDER, or use resume=last.")
+        folder = Path(_unquote(given["run.folder"]))
+        if not _has_checkpoint(folder):
+            return [word for word in overrides if not word.startswith("resume=")]
+    elif wanted == "last":
+        folder = _youngest_run(Path(_unquote(given.get("run.root", "runs"))), given.get("experiment"))
+    else:
+        folder = Path(wanted).expanduser()
+    if not _has_checkpoint(folder):
+        raise CheckpointError(
+            f"there is nothing to resume in {folder}.\nIt holds no checkpoints/last.ckpt.\n"
+            "Name the folder of a run (resume=runs/EXPERIMENT/RUN), or leave resume away to start anew."
+        )
+    merged = _as_mapping([*_saved_overrides(folder), *overrides])
+    merged["resume"] = merged["run.folder"] = _quote(str(folder.absolute()))
+    return [f"{key}={value}" for key, value in merged.items()]
+
+
+def _has_checkpoint(folder: Path) -> bool:
+    from vpd_lightning.training.checkpoint_io import LAST, PREVIOUS
+    from vpd_lightning.training.checkpoints import FOLDER
+
+    return any((folder / FOLDER / name).is_file() for name in (LAST, PREVIOUS))
+
+
+def _youngest_run(root: Path, experiment: str | None) -> Path:
+    from vpd_lightning.training.checkpoints import latest_run
+
+    folders = [root / _unquote(experiment)] if experiment else sorted(path for path in root.glob("*") if path.is_dir())
+    runs = []
+    for folder in folders:
+        try:
+            runs.append(latest_run(folder))
+        except CheckpointError:
+            continue  # this experiment has no run with a checkpoint
+    if not runs:
+        of = f" of experiment {experiment}" if experiment else ""
+        raise CheckpointError(
+            f"there is nothing to resume in {root.absolute()}.\nNo run{of} there has saved a checkpoint.\n"
+            "Leave resume=last away to start a run, or name the folder of one: resume=FOLDER"
+        )
+    return max(runs, key=lambda run: max(path.stat().st_mtime for path in run.glob("checkpoints/last*.ckpt")))
+
+
+def _as_mapping(overrides: Sequence[str]) -> dict[str, str]:
+    """Split the words; a later one replaces an earlier one of the same key."""
+    merged: dict[str, str] = {}
+    for word in overrides:
+        key, _, value = word.partition("=")
+        merged.pop(key, None)
+        merged[key] = value
+    return merged
+
+
+def _saved_overrides(folder: Path) -> list[str]:
+    path = folder / OVERRIDES_FILE
+    try:
+        words = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CheckpointError(
+            f"cannot read {path}, so the settings of the run are unknown.\n{str(error).splitlines()[0]}\n"
+            "Restore the file, or start anew."
+        ) from error
+    if not isinstance(words, list) or not all(isinstance(word, str) and "=" in word for word in words):
+        raise CheckpointError(f"{path} is not a list of overrides.\nRestore the file, or start anew.")
+    return words
+
+
+def _unquote(value: str) -> str:
+    return value[1:-1] if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"" else value
+
+
+def _quote(value: str) -> str:
+    """Quote what Hydra's grammar would not read as one word."""
+    return value if re.fullmatch(r"[\w./-]+", value) else "'" + value.replace("'", "\\'") + "'"

@@ -1,0 +1,163 @@
+"""``vpd-train``: compose, make the run folder, build everything, train."""
+
+import logging
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from vpd_lightning.commands.hydra_application import Arguments, answer, parse_arguments, run_hydra
+from vpd_lightning.commands.report_errors import format_error, run_command
+from vpd_lightning.errors import ConfigError, VPDError
+
+SECTIONS = (
+    "model", "data", "encoder", "dynamics", "renderer", "loss", "optimizer", "trainer", "callbacks", "logger"
+)  # fmt: skip
+# Sections refer to the run folder, which has no name yet when they are checked.
+_PROBE = ("run.folder=not-chosen-yet",)
+
+log = logging.getLogger(__name__)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    return run_command(lambda: _train(list(sys.argv[1:] if argv is None else argv)))
+
+
+def _train(argv: list[str]) -> int:
+    arguments = parse_arguments(argv)
+    if arguments.is_question:
+        answer("train", argv)
+        return 0
+    from vpd_lightning.commands.resume import resumed_overrides
+    from vpd_lightning.config import compose, expand_sweep
+
+    overrides = resumed_overrides(arguments.overrides)
+    jobs = expand_sweep("train", overrides, arguments.config_dir) if arguments.is_multirun else [overrides]
+    configs = [compose("train", words, arguments.config_dir) for words in jobs]
+    _check_places(configs, overrides, arguments)
+    for words in jobs:
+        _check_sections(compose("train", [*words, *_PROBE], arguments.config_dir))
+
+    failures: list[Exception] = []
+
+    def job(config: Any) -> None:
+        """One run; errors are kept, so that Hydra prints nothing of its own and a sweep goes on."""
+        try:
+            _run_job(config)
+        except Exception as error:
+            failures.append(error)
+            if arguments.is_multirun:
+                _show(error)
+
+    run_hydra("train", [*arguments.flags, *overrides], job)
+    if not failures:
+        return 0
+    if arguments.is_multirun:
+        print(f"{len(failures)} of {len(jobs)} runs failed.", file=sys.stderr)
+        return getattr(failures[0], "exit_code", 1)
+    raise failures[0]
+
+
+def _show(error: Exception) -> None:
+    """Print the error of one run of a sweep: in short where it is a named one, else with its traceback."""
+    if isinstance(error, VPDError):
+        print(format_error(error), file=sys.stderr)
+    else:
+        traceback.print_exception(error)
+
+
+def _check_sections(config: dict[str, Any]) -> None:
+    """Refuse, before a folder is made, classes that may not be built, arguments they do not take, unequal widths."""
+    from vpd_lightning.config import check_targets, check_widths
+
+    for section in SECTIONS:
+        check_targets(config[section], section)
+    check_widths(config)
+
+
+def _check_places(configs: Sequence[dict[str, Any]], overrides: Sequence[str], arguments: Arguments) -> None:
+    """Refuse run folders that exist, and runs that would share one."""
+    for config in configs:
+        _check_folder(config)
+    if arguments.is_multirun:
+        launcher = next((word for word in overrides if word.startswith("hydra/launcher=")), "")
+        if "submitit" not in launcher:
+            for config in configs:
+                _refuse_several_devices(config["trainer"])
+        if any(config["run"]["folder"] for config in configs):
+            raise ConfigError("run.folder names one folder, but a sweep makes many.\nUse run.root=FOLDER.")
+    elif _world_size() > 1 and not configs[0]["run"]["folder"]:
+        raise ConfigError(
+            "several processes were started, and each would choose a run folder of its own.\n"
+            "Give them one: run.folder=FOLDER. (vpd-train starts its own processes with trainer=ddp.)"
+        )
+
+
+def _check_folder(config: dict[str, Any]) -> None:
+    folder = config["run"]["folder"]
+    if not folder or config["resume"] or not _is_rank_zero():
+        return
+    path = Path(folder).expanduser()
+    if path.is_file() or (path.is_dir() and any(path.iterdir())):
+        raise ConfigError(
+            f"run.folder={folder} exists already, and nothing is overwritten.\n"
+            f"Go on with it: resume={folder}; or name another folder; or leave run.folder away."
+        )
+
+
+def _refuse_several_devices(trainer: dict[str, Any]) -> None:
+    """Each process of a multi-device run would start the whole sweep again."""
+    devices = trainer.get("devices")
+    count = len(devices) if isinstance(devices, list) else devices
+    if count in ("auto", -1, "-1") and trainer.get("accelerator") != "cpu":
+        import torch
+
+        count = max(torch.cuda.device_count(), 1)
+    many = trainer.get("num_nodes", 1) > 1 or (str(count).isdigit() and int(str(count)) > 1)
+    if many:
+        raise ConfigError(
+            f"a sweep over runs with several devices (trainer.devices={devices}) would start itself once per device.\n"
+            "Set trainer.devices=1, or send the runs to a cluster: hydra/launcher=submitit_slurm."
+        )
+
+
+def _run_job(config: Any) -> None:
+    from hydra.core.hydra_config import HydraConfig
+
+    from vpd_lightning.commands.training_run import close_log, train_in
+    from vpd_lightning.config import plain
+    from vpd_lightning.config.run_folders import ENVIRONMENT
+
+    hydra = HydraConfig.get()
+    folder = Path(hydra.runtime.output_dir)
+    config.run.folder = str(folder)
+    before = os.environ.get(ENVIRONMENT)
+    os.environ[ENVIRONMENT] = str(folder)  # processes that Lightning starts inherit it
+    try:
+        train_in(folder, plain(config), [str(word) for word in hydra.overrides.task], is_rank_zero=_is_rank_zero())
+    finally:
+        close_log(folder)
+        if before is None:
+            del os.environ[ENVIRONMENT]
+
+
+def _world_size() -> int:
+    """Processes that something else started (torchrun, srun); those that Lightning starts know their folder."""
+    from vpd_lightning.config.run_folders import ENVIRONMENT
+
+    if os.environ.get(ENVIRONMENT):
+        return 1
+    is_interactive = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # as Lightning sees it
+    tasks = "1" if is_interactive else os.environ.get("SLURM_NTASKS", "1")
+    return int(os.environ.get("WORLD_SIZE", tasks))
+
+
+def _is_rank_zero() -> bool:
+    return all(os.environ.get(name, "0") == "0" for name in ("RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

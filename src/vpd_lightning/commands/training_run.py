@@ -1,0 +1,233 @@
+"""One training, from its checked configuration to its last step."""
+
+import json
+import logging
+import os
+import shutil
+import signal
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from lightning.pytorch import Callback, LightningDataModule, Trainer
+from lightning.pytorch.loggers import Logger
+
+from vpd_lightning.commands.environment import environment
+from vpd_lightning.commands.resume import OVERRIDES_FILE
+from vpd_lightning.config import build, build_list, build_simulator
+from vpd_lightning.data.manifest import FILE_NAME
+from vpd_lightning.errors import ConfigError, DataError, OutOfMemoryError
+from vpd_lightning.losses.base import AbstractLoss
+from vpd_lightning.randomness import derive_seed
+from vpd_lightning.simulator import Simulator
+from vpd_lightning.training.checkpoint_io import AtomicCheckpointIO
+from vpd_lightning.training.checkpoints import find_resume
+from vpd_lightning.training.module import VPDModule
+from vpd_lightning.training.optimization import AbstractOptimization
+
+CONFIG_FILE = "config.yaml"
+ENVIRONMENT_FILE = "environment.json"
+_CLAIM = ".claimed"
+
+log = logging.getLogger(__name__)
+
+
+def train_in(folder: Path, config: dict[str, Any], overrides: Sequence[str], *, is_rank_zero: bool) -> None:
+    """Train in the run folder; a run that fails before its first step leaves no folder behind.
+
+    Raises:
+        VPDError: whatever is wrong with configuration, data, checkpoint or memory.
+    """
+    is_new = is_rank_zero and not config["resume"]
+    if is_new:
+        _claim(folder)
+    trainer = None
+    try:
+        with _named_memory_errors(), _libraries_in_log():
+            _set_numerics(config)
+            datamodule, module, trainer, checkpoint = _build_all(folder, config)
+            if is_rank_zero:
+                _describe(folder, config, overrides, checkpoint is not None)
+                print(f"run folder: {folder}", flush=True)
+            with _plain_interrupt(), _named_range_errors(trainer):
+                trainer.fit(module, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
+    except BaseException:
+        if is_new and (trainer is None or trainer.global_step == 0):
+            _forget(folder, overrides)
+        raise
+
+
+def _build_all(folder: Path, config: dict[str, Any]) -> tuple[LightningDataModule, VPDModule, Trainer, Path | None]:
+    checkpoint = find_resume(folder) if config["resume"] else None
+    _provide_data(config)
+    datamodule = build(config["data"], LightningDataModule, "data")
+    datamodule.setup("fit")
+    simulator = _build_simulator(config)
+    _fit_background(simulator, datamodule)
+    module = VPDModule(
+        simulator=simulator,
+        losses=build_list(config["loss"], AbstractLoss, "loss"),
+        optimization=build(config["optimizer"], AbstractOptimization, "optimizer"),
+        config=config,
+    )
+    trainer = build(
+        config["trainer"],
+        Trainer,
+        "trainer",
+        logger=build_list(config["logger"], Logger, "logger") or False,
+        callbacks=build_list(config["callbacks"], Callback, "callbacks"),
+        plugins=[AtomicCheckpointIO()],
+    )
+    return datamodule, module, trainer, checkpoint
+
+
+def _build_simulator(config: dict[str, Any]) -> Simulator:
+    """Build the simulator with initial weights that depend on the seed alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive_seed(config["seed"], "weights"))
+        return build_simulator(config)
+
+
+def _fit_background(simulator: Simulator, datamodule: Any) -> None:
+    background = simulator.encoder.background
+    if background is not None:
+        background.fit(*datamodule.median_background())  # type: ignore[operator]
+
+
+def _provide_data(config: dict[str, Any]) -> None:
+    """Generate the data set where it is missing and the configuration says so; else say how to get it."""
+    folder, wanted = Path(config["data"]["folder"]), config["generate"]
+    if (folder / FILE_NAME).is_file():
+        return
+    if wanted is None:
+        raise DataError(
+            f"there is no data set in {folder} (no {FILE_NAME}).\n"
+            "Point data.folder at one; vpd-data --help says how to generate or import recordings."
+        )
+    command = f"vpd-data generate scene={wanted['scene']} preset={wanted['preset']} out={folder}"
+    if not wanted["when_missing"]:
+        raise DataError(f"there is no data set in {folder} (no {FILE_NAME}).\nMake it: {command}")
+    if int(os.environ.get("LOCAL_RANK", "0")) > 0:
+        raise DataError(f"there is no data set in {folder}.\nMake it before training on several devices: {command}")
+    from data_gen.generate import generate
+
+    print(f"there is no data set in {folder}; making it: {command}", flush=True)
+    generate(scene=wanted["scene"], preset=wanted["preset"], out=folder, seed=wanted["seed"])
+
+
+def _set_numerics(config: dict[str, Any]) -> None:
+    """Set threads and the precision of float32 products explicitly, and write down what was set."""
+    if config["num_threads"] is not None:
+        torch.set_num_threads(config["num_threads"])
+    precision = config["float32_matmul_precision"]
+    torch.set_float32_matmul_precision(precision)
+    torch.backends.cudnn.allow_tf32 = precision != "highest"
+    log.info(
+        "float32 products: %s (TF32 %s); deterministic: %s; precision: %s; threads: %d",
+        precision,
+        "off" if precision == "highest" else "on",
+        config["deterministic"],
+        config["trainer"].get("precision"),
+        torch.get_num_threads(),
+    )
+
+
+def _claim(folder: Path) -> None:
+    """Take the folder for this run; two runs that chose the same name at the same moment must not mix."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with (folder / _CLAIM).open("x") as stream:
+            stream.write(f"{os.getpid()}\n")
+    except FileExistsError as error:
+        raise ConfigError(f"another run has just taken {folder}.\nStart again, or name another run.folder.") from error
+
+
+def _describe(folder: Path, config: dict[str, Any], overrides: Sequence[str], is_resumed: bool) -> None:
+    """Write down what the run was asked to do and where it runs; a resumed run keeps its first settings beside."""
+    stamp = f".resumed-{len(list(folder.glob('config*.yaml')))}" if is_resumed else ""
+    kept = [word for word in overrides if not word.startswith(("resume=", "run.folder="))]
+    (folder / f"config{stamp}.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
+    (folder / f"environment{stamp}.json").write_text(json.dumps(environment(), indent=1) + "\n", encoding="utf-8")
+    (folder / OVERRIDES_FILE).write_text(yaml.safe_dump(kept), encoding="utf-8")
+    (folder / _CLAIM).unlink(missing_ok=True)
+
+
+def close_log(folder: Path) -> None:
+    """Let go of the run's log file, which Hydra opened: a sweep opens one per run."""
+    root = logging.getLogger()
+    for handler in list(root.handlers):
+        if isinstance(handler, logging.FileHandler) and Path(handler.baseFilename).parent == folder.absolute():
+            root.removeHandler(handler)
+            handler.close()
+
+
+def _forget(folder: Path, overrides: Sequence[str]) -> None:
+    """Remove the folder of a run that never made a step, and what was made to hold it."""
+    close_log(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+    if not any(word.startswith("run.folder=") for word in overrides):  # else the place is the user's own
+        with suppress(OSError):  # other runs are there
+            folder.parent.rmdir()
+            folder.parent.parent.rmdir()
+
+
+@contextmanager
+def _libraries_in_log() -> Iterator[None]:
+    """Send what Lightning says, and warnings, to the run's log instead of the terminal."""
+    loggers = [logging.getLogger(name) for name in ("lightning", "lightning.pytorch", "lightning.fabric")]
+    before = [(list(logger.handlers), logger.propagate) for logger in loggers]
+    for logger in loggers:
+        logger.handlers, logger.propagate = [], True
+    logging.captureWarnings(True)
+    try:
+        yield
+    finally:
+        logging.captureWarnings(False)
+        for logger, (handlers, propagate) in zip(loggers, before, strict=True):
+            logger.handlers, logger.propagate = handlers, propagate
+
+
+@contextmanager
+def _named_memory_errors() -> Iterator[None]:
+    """Say which knobs to turn where memory ran out."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        text = str(error).lower()
+        if isinstance(error, MemoryError | torch.OutOfMemoryError) or "out of memory" in text or "alloc_cpu" in text:
+            raise OutOfMemoryError(
+                "memory ran out.\n"
+                "Lower renderer.ray_chunk_size (same result), data.batch_size, data.rays_per_step, data.num_steps or\n"
+                "encoder.num_particles; or use more devices: each takes its share of data.batch_size."
+            ) from error
+        raise
+
+
+@contextmanager
+def _named_range_errors(trainer: Trainer) -> Iterator[None]:
+    """Before the first step, a value that our code refuses is a fault of the configuration, not of the program."""
+    try:
+        yield
+    except ValueError as error:
+        frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+        is_ours = frames[-1].f_globals.get("__name__", "").startswith("vpd_lightning.")
+        if trainer.global_step > 0 or not is_ours:
+            raise
+        raise ConfigError(f"the training cannot start.\n{error}") from error
+
+
+@contextmanager
+def _plain_interrupt() -> Iterator[None]:
+    """Turn Lightning's answer to Ctrl-C, an exit with code 1, back into the interrupt it was."""
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    except SystemExit as stop:
+        if stop.code == 1 and isinstance(stop.__context__, KeyboardInterrupt):
+            signal.signal(signal.SIGINT, handler)
+            raise KeyboardInterrupt from stop
+        raise

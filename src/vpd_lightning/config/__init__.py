@@ -1,0 +1,19 @@
+"""Configuration: composing it, checking it, and the one place that turns it into objects."""
+
+from vpd_lightning.config.building import build, build_list, build_simulator, check_targets, check_widths
+from vpd_lightning.config.composing import compose, expand_sweep, plain
+from vpd_lightning.config.paths import config_folder
+from vpd_lightning.config.plugins import load_plugins
+
+__all__ = [
+    "build",
+    "build_list",
+    "build_simulator",
+    "check_targets",
+    "check_widths",
+    "compose",
+    "config_folder",
+    "expand_sweep",
+    "load_plugins",
+    "plain",
+]

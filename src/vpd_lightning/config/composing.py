@@ -1,0 +1,122 @@
+"""From command-line words to one checked, plain configuration."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from vpd_lightning.config.explaining import explain, explain_missing_value, refuse_bypasses
+from vpd_lightning.config.paths import config_folder
+from vpd_lightning.config.plugins import load_plugins
+from vpd_lightning.config.run_folders import register_resolvers
+from vpd_lightning.config.schema import EvalConfig, RenderConfig, TrainConfig, check_scene, check_training
+from vpd_lightning.errors import ConfigError
+
+SCHEMAS: dict[str, type] = {"train": TrainConfig, "eval": EvalConfig, "render": RenderConfig}
+
+
+def prepare() -> None:
+    """Load plug-ins, register the schemas and the resolvers; safe to call again."""
+    load_plugins()
+    register_resolvers()
+    for command, schema in SCHEMAS.items():
+        ConfigStore.instance().store(name=f"{command}_schema", node=schema)
+
+
+def compose(command: str, overrides: Sequence[str], config_dir: str | Path | None = None) -> dict[str, Any]:
+    """Return the plain, resolved and checked configuration of a command.
+
+    Args:
+        command: name of the root, ``conf/<command>.yaml``.
+        overrides: words as on the command line, ``key=value`` or ``group=option``.
+        config_dir: a folder with further options (``--config-dir``).
+
+    Raises:
+        ConfigError: an unknown key, option or type, a value out of range, or a bypass of the schema.
+    """
+    prepare()
+    refuse_bypasses(overrides)
+    config = _compose(command, overrides, config_dir)
+    schema = SCHEMAS.get(command)
+    if schema is not None:
+        _check_again(schema, config)
+    result = plain(config)
+    if "scene" in result:
+        check_scene(result["scene"])
+    if command == "train":
+        check_training(result)
+    return result
+
+
+def plain(config: Any) -> dict[str, Any]:
+    """Return the configuration as resolved dictionaries, lists and scalars: what a checkpoint may hold.
+
+    Raises:
+        ConfigError: a value is missing, or refers to one that is not there.
+    """
+    try:
+        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        raise explain_missing_value(error) from error
+
+
+def expand_sweep(command: str, overrides: Sequence[str], config_dir: str | Path | None = None) -> list[list[str]]:
+    """Return the overrides of every job of a sweep, in the order of Hydra's own sweeper.
+
+    Raises:
+        ConfigError: a word cannot be read, or bypasses the schema.
+    """
+    refuse_bypasses(overrides)
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        jobs = [override for override in parsed if not override.is_hydra_override()]
+        return BasicSweeper.split_arguments(jobs, max_batch_size=None)[0]
+    except HydraException as error:
+        raise explain(error, command, overrides, lambda words: _compose(command, words, config_dir)) from error
+
+
+def _compose(command: str, overrides: Sequence[str], config_dir: str | Path | None) -> Any:
+    """Compose with Hydra; leaves a Hydra that is already running (a job of its own) as it was."""
+    folders = [str(folder) for folder in load_plugins().config_folders]
+    if config_dir is not None:
+        if not Path(config_dir).is_dir():
+            raise ConfigError(f"the configuration folder {config_dir} does not exist.\nIt was given by --config-dir.")
+        folders.insert(0, str(Path(config_dir).resolve()))
+    words = [*overrides, *_search_path(folders, overrides)]
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(config_folder()), version_base="1.3"):
+            return hydra_compose(command, words)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        raise explain(error, command, overrides, lambda fewer: _compose(command, fewer, config_dir)) from error
+    finally:
+        GlobalHydra.instance().hydra = running
+
+
+def plugin_search_path(overrides: Sequence[str]) -> list[str]:
+    """Return the word that shows Hydra the configuration folders of plug-ins, or nothing where there are none."""
+    return _search_path([str(folder) for folder in load_plugins().config_folders], overrides)
+
+
+def _search_path(folders: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    if not folders or any(word.startswith("hydra.searchpath=") for word in overrides):
+        return []  # the user's own list wins
+    return ["hydra.searchpath=[" + ",".join(f"'file://{folder}'" for folder in folders) + "]"]
+
+
+def _check_again(schema: type, config: Any) -> None:
+    """Merge the plain container into the empty schema: the only merge that refuses keys added behind its back."""
+    try:
+        OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.to_container(config))
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"the configuration does not fit its schema.\n{str(error).splitlines()[0]}") from error

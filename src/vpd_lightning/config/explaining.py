@@ -1,0 +1,155 @@
+"""What Hydra and OmegaConf say, said so that a person can act on it."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from difflib import SequenceMatcher, get_close_matches
+from typing import Any
+
+from hydra.errors import MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationKeyError, MissingMandatoryValue, ValidationError
+
+from vpd_lightning.errors import ConfigError
+
+
+def refuse_bypasses(overrides: Sequence[str]) -> None:
+    """Refuse words that add or remove keys: every key there is has its place in ``conf/``.
+
+    Raises:
+        ConfigError: a word begins with ``+`` or ``~``.
+    """
+    for word in overrides:
+        if word.startswith(("+", "~")):
+            does = "adds" if word.startswith("+") else "removes"
+            raise ConfigError(
+                f"'{word}' {does} a key behind the schema's back.\n"
+                "Every setting has its place in the configuration; --cfg job lists them all.\n"
+                "To set a key that is there, leave the sign away; a new option goes into a folder for --config-dir."
+            )
+
+
+def explain(
+    error: Exception, command: str, overrides: Sequence[str], compose: Callable[[Sequence[str]], Any]
+) -> ConfigError:
+    """Return the error to show for one that came out of composing; ``compose`` composes fewer words."""
+    cause = error.__cause__ or error
+    text = str(error)
+    if isinstance(error, ConfigError):
+        return error
+    if isinstance(error, OverrideParseException):
+        return ConfigError(
+            f"cannot read '{error.override}'.\n{_first_line(text, skip='Error parsing')}\n"
+            f"Write key=value or group=option, without spaces around '=', for example: vpd-{command} seed=1"
+        )
+    if isinstance(error, MissingConfigException):
+        return _explain_missing_option(text, overrides)
+    unknown = re.search(r"Could not override '([^']+)'", text)
+    if unknown is not None:
+        return _explain_unknown_key(unknown[1], str(cause), overrides, compose)
+    if isinstance(cause, ValidationError):
+        return _explain_wrong_type(cause)
+    if "Config group override must be" in text:
+        group = next((w for w in overrides if w.partition("=")[2] in ("", "null") or _is_number(w)), "a group")
+        return ConfigError(f"'{group}' does not name an option.\nA group takes the name of one of its files.")
+    if "Ambiguous value" in text:
+        word = re.search(r"'([^']+)'", text)
+        return ConfigError(
+            f"'{word[1] if word else ''}' has several values.\n"
+            "For a sweep add -m; for a list write key=[1,2] (quote it for the shell)."
+        )
+    if isinstance(error, InterpolationKeyError | MissingMandatoryValue):
+        return explain_missing_value(error)
+    return ConfigError("the configuration cannot be composed.\n" + "\n".join(text.splitlines()[:3]))
+
+
+def explain_missing_value(error: Exception) -> ConfigError:
+    """Return the error for a key without a value, or with a reference that leads nowhere."""
+    key = getattr(error, "full_key", None)
+    if isinstance(error, MissingMandatoryValue):
+        return ConfigError(f"{key or 'a key'} has no value.\nGive one: {key}=...")
+    return ConfigError(f"{key or 'a key'} cannot be resolved.\n{str(error).splitlines()[0]}")
+
+
+def suggest(word: str, known: Sequence[str]) -> str:
+    """Return a sentence with the known words that look like ``word``, or an empty string."""
+    close = get_close_matches(word, known, n=3, cutoff=0.6)
+    best = SequenceMatcher(None, word, close[0]).ratio() if close else 0.0
+    near = [known_word for known_word in close if SequenceMatcher(None, word, known_word).ratio() > best - 0.05]
+    return f"Did you mean {' or '.join(near)}?" if near else ""
+
+
+def keys_of(config: Any, prefix: str = "") -> Iterator[str]:
+    """Yield the full name of every key of a composed configuration."""
+    if isinstance(config, DictConfig):
+        config = OmegaConf.to_container(config, resolve=False)
+    if isinstance(config, dict):
+        for name, value in config.items():
+            yield f"{prefix}{name}"
+            yield from keys_of(value, f"{prefix}{name}.")
+
+
+def _explain_missing_option(text: str, overrides: Sequence[str]) -> ConfigError:
+    wanted = re.search(r"Could not (?:find|load) '([^']+)'", text)
+    if wanted is None:
+        return ConfigError("\n".join(text.splitlines()[:3]))
+    group, _, option = wanted[1].rpartition("/")
+    options = []
+    if "Available options" in text:
+        listing = text.split("Available options", 1)[1].split("Config search path")[0]
+        options = [line.strip() for line in listing.splitlines()[1:] if line.strip()]
+    guess = suggest(option, options)
+    if not options:
+        names = [word.partition("=")[0] for word in overrides]
+        return ConfigError(f"there is no configuration {wanted[1]}.\nGiven: {' '.join(names) or 'nothing'}.")
+    what = "experiment" if group == "experiment" else f"option of {group}"
+    listing = f"There are: {', '.join(options)}."
+    return ConfigError(f"there is no {what} called {option}.\n{guess or 'Check the name.'}\n{listing}")
+
+
+def _explain_unknown_key(
+    key: str, cause: str, overrides: Sequence[str], compose: Callable[[Sequence[str]], Any]
+) -> ConfigError:
+    inner = re.search(r"full_key: (\S+)", cause)
+    key = inner[1] if inner and inner[1] != key and inner[1].startswith(key) else key
+    guess = ""
+    try:
+        others = [word for word in overrides if "." not in word.partition("=")[0] and not word.startswith(key)]
+        known = list(keys_of(compose(others)))
+        guess = _nearest_key(key, known)
+    except ConfigError:
+        pass  # something else is wrong too; the key alone says enough
+    return ConfigError(f"there is no key {key}.\n{guess or 'All keys: --cfg job.'}")
+
+
+def _nearest_key(key: str, known: Sequence[str]) -> str:
+    """Suggest, in this order: the section spelt right, a near neighbour, the same word in another section, any key."""
+    section, _, leaf = key.rpartition(".")
+    for near in get_close_matches(section, sorted({name.rpartition(".")[0] for name in known}), cutoff=0.75):
+        if near != section and f"{near}.{leaf}" in known:
+            return f"Did you mean {near}.{leaf}?"
+    siblings = [name for name in known if name.rpartition(".")[0] == section]
+    leaves = {name.rpartition(".")[2]: name for name in siblings}
+    close = get_close_matches(leaf, leaves, n=1, cutoff=0.8)
+    if close:
+        return f"Did you mean {leaves[close[0]]}?"
+    elsewhere = [name for name in known if name.rpartition(".")[2] == leaf]
+    if elsewhere:
+        return f"Did you mean {' or '.join(elsewhere[:3])}?"
+    return suggest(key, siblings) or suggest(key, known)
+
+
+def _explain_wrong_type(cause: Exception) -> ConfigError:
+    key = getattr(cause, "full_key", None) or re.search(r"full_key: (\S+)", str(cause))
+    name = key if isinstance(key, str) else key[1] if key else "a key"
+    reason = str(cause).splitlines()[0].replace("Integer", "a whole number").replace("Float", "a number")
+    return ConfigError(f"{name} has the wrong type.\n{reason.rstrip('.')}.")
+
+
+def _first_line(text: str, skip: str) -> str:
+    lines = [line for line in text.splitlines() if line and not line.startswith((skip, "See "))]
+    return lines[0] if lines else ""
+
+
+def _is_number(word: str) -> bool:
+    value = word.partition("=")[2]
+    return "." not in word.partition("=")[0] and bool(re.fullmatch(r"-?\d+(\.\d+)?|true|false", value.lower()))

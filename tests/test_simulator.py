@@ -1,0 +1,153 @@
+"""Encode, roll out, render: the parts put together, on a hand-made scene."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.encoder.test_unet import encoder, looking_down
+from vpd_lightning.dynamics.base import AbstractDynamics
+from vpd_lightning.dynamics.persistence import PersistenceDynamics
+from vpd_lightning.geometry.cameras import pixel_rays
+from vpd_lightning.losses.pixel import PixelLoss
+from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.renderer.splat import SplatRenderer
+from vpd_lightning.simulator import Simulator
+from vpd_lightning.types import Cameras, Rays, RenderedRays, RGBDFrames, SimulatorOutput, VideoBatch
+
+NUM_STEPS = 3
+
+
+class Drift(AbstractDynamics):
+    """Moves everything by a learned step, a little differently at each rollout step."""
+
+    def __init__(self):
+        super().__init__()
+        self.step = torch.nn.Parameter(torch.tensor([0.01, 0.0, 0.02]))
+
+    def forward(self, previous, current, memory, keys, rollout_step):
+        jitter = torch.stack([torch.rand(3, generator=g) for g in keys.generators(f"drift/{rollout_step}")])
+        return replace(current, positions=current.positions + self.step * (1 + jitter[:, None])), memory
+
+
+def renderer():
+    return SplatRenderer(
+        feature_dim=5, hidden_dim=16, num_layers=2, num_candidates=8, kernel_scales=[0.05, 0.2],
+        layer_depth=0.1, near=0.1, far=10.0, ray_chunk_size=64,
+    )  # fmt: skip
+
+
+def simulator(dynamics=None, **changes):
+    settings = {"location_noise": 0.0, "checkpoint_dynamics": False, **changes}
+    return Simulator(encoder=encoder(), dynamics=dynamics or PersistenceDynamics(), renderer=renderer(), **settings)
+
+
+def batch(size=2, num_rays=6, seed=0, first_index=0):
+    generator = torch.Generator().manual_seed(seed)
+    cameras = looking_down()
+    pose = Cameras(cameras.intrinsics.expand(size, 2, -1, 3, 3), cameras.cam_to_world.expand(size, 2, -1, 4, 4), 8, 8)
+    rgb = torch.randint(0, 256, (size, 2, 2, 8, 8, 3), generator=generator, dtype=torch.uint8)
+    depth = 1.8 + 0.2 * torch.rand(size, 2, 2, 8, 8, generator=generator)
+    rays = pixel_rays(cameras)
+    chosen = torch.randint(0, 128, (size, NUM_STEPS, num_rays), generator=generator)
+    return VideoBatch(
+        context=RGBDFrames(rgb, depth, pose),
+        rays=Rays(rays.origins.reshape(-1, 3)[chosen], rays.directions.reshape(-1, 3)[chosen]),
+        rgbs=torch.rand(size, NUM_STEPS, num_rays, 3, generator=generator),
+        keys=RandomKeys(seed=7, step=3, sample_index=list(range(first_index, first_index + size))),
+        clips=[f"clip{i}" for i in range(size)],
+    )
+
+
+def member(data, index):
+    return VideoBatch(
+        context=data.context[index : index + 1],
+        rays=Rays(data.rays.origins[index : index + 1], data.rays.directions[index : index + 1]),
+        rgbs=data.rgbs[index : index + 1],
+        keys=replace(data.keys, sample_index=[data.keys.sample_index[index]]),
+        clips=[data.clips[index]],
+    )
+
+
+def test_output_has_a_colour_for_every_ray_of_every_step():
+    output = simulator()(batch())
+
+    assert output.rendered.rgbs.shape == (2, NUM_STEPS, 6, 3)
+    assert len(output.states) == NUM_STEPS
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_batch_equals_its_members(noise):
+    model = simulator(Drift(), location_noise=noise)
+    data = batch()
+
+    together = model(data).rendered.rgbs
+
+    for index in range(2):
+        assert torch.allclose(model(member(data, index)).rendered.rgbs, together[index : index + 1], atol=1e-6)
+
+
+def test_rays_of_a_step_see_the_particles_of_that_step():
+    model = simulator(Drift()).eval()
+    data = batch()
+    states = model(data).states
+
+    for step in (0, NUM_STEPS - 1):
+        alone = model.renderer(states[step], Rays(data.rays.origins[:, step], data.rays.directions[:, step]), None)
+        assert torch.allclose(model(data).rendered.rgbs[:, step], alone.rgbs, atol=1e-6)
+
+
+def test_checkpointed_dynamics_gives_the_same_gradients():
+    gradients = []
+    for checkpointed in (False, True):
+        torch.manual_seed(0)
+        model = simulator(Drift(), checkpoint_dynamics=checkpointed, location_noise=0.01)
+        model(batch()).rendered.rgbs.square().sum().backward()
+        gradients.append([parameter.grad.clone() for parameter in model.parameters()])
+
+    for plain, recomputed in zip(*gradients, strict=True):
+        assert torch.equal(plain, recomputed)
+
+
+def test_noise_is_for_training_only():
+    model = simulator(location_noise=0.1)
+
+    noisy = model(batch()).states[-1].positions
+    quiet = model.eval()(batch()).states[-1].positions
+
+    assert (noisy - quiet).abs().max() > 0.05
+    assert torch.equal(quiet, model(batch()).states[0].positions)
+
+
+def test_the_python_face_encodes_rolls_out_and_renders():
+    model, data, cameras = simulator(Drift()), batch(), looking_down()
+
+    scene = model.encode(data.context.rgb[0], data.context.depth[0], cameras)
+    states = model.rollout(scene, num_steps=2)
+    frames = model.render(states, cameras)
+    maps = model.render_maps(states, cameras)
+
+    assert frames.shape == (2, 2, 8, 8, 3) and (frames >= 0).all() and (frames <= 1).all()
+    assert maps.depths.shape == (2, 2, 8, 8) and maps.opacities.shape == (2, 2, 8, 8)
+    assert torch.equal(frames, model.render(model.rollout(model.encode(
+        data.context.rgb[0].float() / 255, data.context.depth[0].double(), cameras), 2), cameras))  # fmt: skip
+
+
+def test_frames_of_the_wrong_shape_are_refused():
+    data = batch()
+    with pytest.raises(ValueError, match="view, height, width"):
+        simulator().encode(data.context.rgb[0, :1], data.context.depth[0, :1], looking_down())
+
+
+def test_negative_noise_is_refused():
+    with pytest.raises(ValueError, match="location_noise"):
+        simulator(location_noise=-1.0)
+
+
+def test_pixel_loss_is_the_mean_square_over_steps_and_rays_plus_the_coarse_tier():
+    data = batch()
+    exact = RenderedRays(data.rgbs, torch.zeros(2, NUM_STEPS, 6), torch.ones(2, NUM_STEPS, 6), data.rgbs + 0.5)
+
+    loss = PixelLoss(weight=1.0, coarse_weight=0.2)(SimulatorOutput(exact, []), data)
+
+    assert torch.allclose(loss, torch.tensor(0.2 * 0.25))
