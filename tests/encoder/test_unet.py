@@ -90,6 +90,23 @@ def test_an_empty_workspace_is_an_error_that_says_what_to_check():
         encoder(workspace_min=[5, 5, 5], workspace_max=[6, 6, 6])(frames(), RandomKeys.fixed(2), "current")
 
 
+def test_the_last_convolution_at_chosen_pixels_equals_the_whole_one():
+    torch.manual_seed(0)
+    network = UNetNetwork(channels=[4, 6, 8, 6, 5], in_channels=3).double()
+    images = torch.rand(3, 3, 8, 12, dtype=torch.float64)
+    pixels = torch.randperm(3 * 8 * 12)[:150]  # borders and corners among them, some images more often than others
+
+    chosen = network.at_pixels(images, pixels)
+    whole = network(images).movedim(1, -1).flatten(0, 2)[pixels]
+
+    assert torch.allclose(chosen, whole, atol=1e-12)
+    seed = torch.randn_like(chosen)
+    fast = torch.autograd.grad((chosen * seed).sum(), list(network.parameters()))
+    plain = torch.autograd.grad((whole * seed).sum(), list(network.parameters()))
+    for a, b in zip(fast, plain, strict=True):
+        assert torch.allclose(a, b, atol=1e-10)
+
+
 def test_image_sizes_that_the_network_cannot_halve_are_refused():
     with pytest.raises(ValueError, match="multiple of 4"):
         UNetNetwork(channels=[4, 4, 4, 4, 4], in_channels=3)(torch.zeros(1, 3, 6, 8))

@@ -82,7 +82,6 @@ def test_all_weights_learn_and_an_interrupted_training_equals_an_uninterrupted_o
     check = CheckGradients()
     tiny_trainer(tmp_path / "a", 4, [check], val_check_interval=2).fit(module, datamodule)
     missed = {name for name, parameter in module.named_parameters() if parameter.requires_grad} - check.reached
-    # Shading adds the difference of two evaluations of a network, in which its last bias cancels.
     assert not missed
 
     module, datamodule = build_training(data, model)

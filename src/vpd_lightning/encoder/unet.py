@@ -56,11 +56,20 @@ class UNetEncoder(AbstractEncoder):
 
     def pixel_features(self, rgb: Float[Tensor, "*shape height width 3"]) -> Tensor:
         """Return features of every pixel, axes ``... height width feature``; softplus keeps them positive."""
-        images = rgb.flatten(0, -4).movedim(-1, 1)
-        features = self.network(images)
+        features = self.network(rgb.flatten(0, -4).movedim(-1, 1)).movedim(1, -1)
+        return self._activate(features, rgb.dtype).reshape(*rgb.shape[:-1], self.feature_dim)
+
+    def _features_at(self, rgb: Float[Tensor, "batch view height width 3"], index: Tensor) -> Tensor:
+        """Return the features of the chosen pixels; ``index`` counts over ``view height width`` of each member."""
+        member = torch.arange(len(rgb), device=index.device)[:, None]
+        pixels = (member * rgb[0, ..., 0].numel() + index).flatten()
+        features = self.network.at_pixels(rgb.flatten(0, 1).movedim(-1, 1), pixels)
+        return self._activate(features, rgb.dtype).reshape(*index.shape, self.feature_dim)
+
+    @staticmethod
+    def _activate(features: Tensor, dtype: torch.dtype) -> Tensor:
         # Kernel sums and positions downstream stay in full precision, whatever autocast did to the convolutions.
-        features = torch.nn.functional.softplus(features.to(rgb.dtype))
-        return features.movedim(1, -1).reshape(*rgb.shape[:-1], self.feature_dim)
+        return torch.nn.functional.softplus(features.to(dtype))
 
     def forward(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> EncoderOutput:
         """Encode the frames of one time step (axes ``batch view``).
@@ -69,7 +78,6 @@ class UNetEncoder(AbstractEncoder):
             EmptyWorkspaceError: no measured pixel of a batch member lies in the workspace.
         """
         rgb = frames.rgb if frames.rgb.is_floating_point() else frames.rgb.to(frames.depth.dtype) / 255
-        features = self.pixel_features(rgb).flatten(1, 3)
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
         measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
@@ -85,7 +93,7 @@ class UNetEncoder(AbstractEncoder):
 
         particles = Particles(
             positions=take(points) * valid[..., None],
-            features=take(features) * valid[..., None],
+            features=self._features_at(rgb, index) * valid[..., None],
             mask=valid,
             colors=take(rgb.flatten(1, 3)),
             moving=None if moving is None else torch.gather(moving, 1, index) & valid,

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 
@@ -35,6 +35,38 @@ class UNetNetwork(nn.Module):
 
     def forward(self, images: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image feature h w"]:
         """Return the per-pixel output; height and width must divide by 2^(levels - 1)."""
+        x, skip = self._all_but_last(images)
+        return self.up[-1](torch.cat([_upsample(x), skip], dim=1))
+
+    def at_pixels(
+        self, images: Float[Tensor, "image channel height width"], pixels: Int[Tensor, " particle"]
+    ) -> Float[Tensor, "particle feature"]:
+        """Return the output at the chosen pixels (flat index over image, row, column): equal to ``forward`` there.
+
+        The last convolution is the most expensive one, and most pixels become no particle: it is evaluated where one
+        is, from gathered 3x3 patches, and its input is never up-sampled.
+        """
+        x, skip = self._all_but_last(images)
+        height, width = skip.shape[-2:]
+        steps = torch.arange(-1, 2, device=pixels.device)
+        image = (pixels // (height * width))[:, None, None]
+        rows = (pixels // width % height)[:, None, None] + steps[:, None]
+        columns = (pixels % width)[:, None, None] + steps
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        rows, columns = rows.clamp(0, height - 1), columns.clamp(0, width - 1)
+
+        def gather(values: Tensor, scale: int) -> Tensor:
+            flat = (image * (height // scale) + rows // scale) * (width // scale) + columns // scale
+            return values.movedim(1, -1).flatten(0, 2).index_select(0, flat.flatten())
+
+        last = self.up[-1]
+        assert isinstance(last, nn.Conv2d) and last.bias is not None
+        patches = torch.cat([gather(x, 2), gather(skip, 1)], dim=-1) * inside.flatten()[:, None]
+        weight = last.weight.permute(2, 3, 1, 0).flatten(0, 2)  # row, column, input channel -> output channel
+        return patches.reshape(len(pixels), -1) @ weight.to(patches.dtype) + last.bias.to(patches.dtype)
+
+    def _all_but_last(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the last up-step starts from: the half-size map and the skip of full size."""
         height, width = images.shape[-2:]
         if height % self.size_divisor or width % self.size_divisor:
             raise ValueError(f"image size {height}x{width} must be a multiple of {self.size_divisor}; resize or pad it")
@@ -45,9 +77,10 @@ class UNetNetwork(nn.Module):
             x = torch.relu(conv(x))
             skips.append(x)
         skips.pop()
-        for level, conv in enumerate(self.up):
-            x = nn.functional.interpolate(x, scale_factor=2, mode="nearest")
-            x = conv(torch.cat([x, skips.pop()], dim=1))
-            if level < len(self.up) - 1:
-                x = torch.relu(x)
-        return x
+        for conv in list(self.up)[:-1]:
+            x = torch.relu(conv(torch.cat([_upsample(x), skips.pop()], dim=1)))
+        return x, skips.pop()
+
+
+def _upsample(x: Tensor) -> Tensor:
+    return nn.functional.interpolate(x, scale_factor=2, mode="nearest")
