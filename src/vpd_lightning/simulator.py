@@ -107,7 +107,7 @@ class Simulator(nn.Module):
 
     # The Python face for people who have a trained model.
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def encode(self, rgb: Tensor, depth: Tensor, cameras: Cameras, keys: RandomKeys | None = None) -> Scene:
         """Encode two frames: ``rgb`` (2, view, height, width, 3) uint8 or [0, 1], ``depth`` in metres.
 
@@ -132,18 +132,18 @@ class Simulator(nn.Module):
             states.append(self.encoder(frames, keys, purpose).particles)
         return Scene(*states)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def rollout(self, scene: Scene, num_steps: int, keys: RandomKeys | None = None) -> list[Particles]:
         """Return the predicted particles of the next ``num_steps`` steps (batch axis of 1)."""
         self.eval()
         return self.unroll(scene.previous, scene.current, num_steps, keys or RandomKeys.fixed(1))
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def render(self, states: Sequence[Particles], cameras: Cameras) -> Float[Tensor, "time view height width 3"]:
         """Render full images of the states from the cameras (axis ``view``); colours in [0, 1]."""
         return self.render_maps(states, cameras).rgbs.clamp(0, 1)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def render_maps(self, states: Sequence[Particles], cameras: Cameras) -> RenderedRays:
         """Render colour, expected distance along the ray and opacity, axes ``time view height width``.
 

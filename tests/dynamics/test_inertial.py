@@ -191,6 +191,27 @@ def test_every_parameter_receives_a_finite_gradient():
         assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
 
 
+def test_autocast_leaves_the_geometry_alone():
+    previous, current = (particles.to(torch.float32) for particles in tossed())
+    model = InertialDynamics(**SETTINGS)
+    expected = model.initialize(previous, current, RandomKeys.fixed(1))
+
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        memory = model.initialize(previous, current, RandomKeys.fixed(1))
+
+    for name, value in vars(expected).items():
+        assert torch.equal(getattr(memory, name), value), name
+
+
+def test_features_of_the_first_frame_reach_the_prediction_with_their_gradient():
+    previous, current = tossed()
+    features = current.features.clone().requires_grad_()
+
+    roll(dynamics(), previous, replace(current, features=features), 2)[-1].features.sum().backward()
+
+    assert (features.grad.abs().sum(-1) > 0).all()
+
+
 def test_a_scene_without_candidates_does_not_move():
     _, current = tossed()
     current = replace(current, moving=torch.zeros_like(current.moving))

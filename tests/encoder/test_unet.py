@@ -69,7 +69,7 @@ def test_a_batch_equals_its_members():
 
     alone = model(data[1:], RandomKeys(0, 3, [1]), "current").particles
 
-    assert torch.equal(together.positions[1:], alone.positions)
+    assert torch.equal(together.positions[1:], alone.positions)  # 40 of 128 pixels: every pixel is convolved
     assert torch.allclose(together.features[1:], alone.features, atol=1e-6)
 
 
@@ -105,6 +105,17 @@ def test_the_last_convolution_at_chosen_pixels_equals_the_whole_one():
     plain = torch.autograd.grad((whole * seed).sum(), list(network.parameters()))
     for a, b in zip(fast, plain, strict=True):
         assert torch.allclose(a, b, atol=1e-10)
+
+
+@pytest.mark.parametrize("num_particles", [8, 40])
+def test_few_and_many_particles_get_the_features_of_their_pixels(num_particles):
+    model, data = encoder(num_particles=num_particles), frames()
+
+    particles = model(data, RandomKeys.fixed(2), "current").particles
+
+    every = model.pixel_features(data.rgb.float() / 255).flatten(1, 3)
+    gaps = (particles.features[:, :, None] - every[:, None]).abs().amax(-1).amin(-1)
+    assert gaps.max() < 1e-6
 
 
 def test_image_sizes_that_the_network_cannot_halve_are_refused():

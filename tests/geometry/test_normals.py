@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from tests.geometry.test_cameras import random_cameras
@@ -27,6 +28,19 @@ def test_a_step_keeps_the_normals_of_both_sides():
     normals = depth_normals(depth, downward_camera())
 
     assert (normals[1:-1, 1:-1, 2] > 0.999).all()
+
+
+@pytest.mark.parametrize("missing", [0.0, float("nan"), float("inf")])
+def test_a_hole_does_not_bend_the_normals_around_it(missing):
+    depth = torch.full((8, 8), 2.0, dtype=torch.float64)
+    depth[3:5, 2:6] = missing
+    depth[6, 1] = depth[6, 3] = missing  # a pixel without any neighbour along its row
+
+    normals = depth_normals(depth, downward_camera())
+
+    known = normals.norm(dim=-1) > 0
+    assert torch.allclose(normals[known], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    assert not known[3:5, 2:6].any() and not known[6, 2] and known[2, 3]
 
 
 def test_missing_depth_gives_zero_normals_and_no_nan():

@@ -1,5 +1,7 @@
 """The learned part of the inertial dynamics: forces on bodies from contact, weight and one another."""
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -14,7 +16,8 @@ class BodyForces(nn.Module):
     Probes send their state and contact to the anchors; anchors exchange messages; each anchor then places
     ``num_forces`` forces by attention over its probes. A force changes the anchor's displacement by itself, and its
     spin by the torque about the anchor's centre through the inverse inertia, so that a contact at a few particles
-    moves and turns the whole body (Newton-Euler). Damping scales what was carried: impacts and friction remove motion
+    moves and turns the whole body (Newton-Euler). One more force acts at the centre, without torque, as weight does.
+    Damping scales what was carried: impacts and friction remove motion
     in proportion to it. Zero-initialised: no force, no damping.
     """
 
@@ -35,9 +38,10 @@ class BodyForces(nn.Module):
         self.force = nn.Linear(hidden_dim, 3 * num_forces)
         self.offset_query = nn.Linear(3, hidden_dim, bias=False)
         self.damping = nn.Linear(hidden_dim, 2)
+        self.weight = nn.Linear(hidden_dim, 3)
         # Mass inside a body is not where its surface particles are: one learned factor on their inverse inertia.
         self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
-        for layer in (self.force, self.damping):
+        for layer in (self.force, self.damping, self.weight):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
@@ -56,7 +60,9 @@ class BodyForces(nn.Module):
         share = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-12)
         mean = torch.einsum("bap,bph->bah", share, probe)
         gate = (share / share.amax(dim=-1, keepdim=True).clamp(min=1e-12))[..., None]
-        peak = (probe[:, None] * gate).amax(dim=2)
+        # Padding must not win the maximum with its zero; an anchor without any probe gets zero.
+        peak = (probe[:, None] * gate).masked_fill(~mask[:, None, :, None], -torch.inf).amax(dim=2)
+        peak = torch.where(mask.any(dim=1)[:, None, None], peak, 0.0)
         clearance = self._clearance(contacts, mask, share)
         anchor = torch.cat([mean, peak, twists.displacements / self.scale, twists.spins, clearance], dim=-1)
         anchor = self.encode_anchor(anchor)
@@ -117,11 +123,11 @@ class BodyForces(nn.Module):
         forces = attention[..., None] * forces
         push = forces.sum(dim=(2, 3))
         torque = cross(offsets, forces.sum(dim=3)).sum(dim=2)
-        # 2 * sigmoid: one at initialisation; may remove motion (towards 0), hardly add it.
-        keep = (2 * torch.sigmoid(self.damping(anchor))).clamp(max=1.05)
+        # One at initialisation; may remove motion (towards 0), hardly add it (at most 5 %).
+        keep = 1.05 * torch.sigmoid(self.damping(anchor) + math.log(1 / 0.05))
         return Twists(
             centers=twists.centers,
-            displacements=twists.displacements * keep[..., :1] + push,
+            displacements=twists.displacements * keep[..., :1] + push + self.scale * torch.tanh(self.weight(anchor)),
             spins=twists.spins * keep[..., 1:] + rotate(inverse_inertia, torque) * torch.exp(self.log_inertia_ratio),
         )
 

@@ -1,7 +1,7 @@
 """Inertial dynamics: what moves keeps moving as a locally rigid body; a graph network predicts the corrections."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -110,6 +110,11 @@ class InertialDynamics(AbstractDynamics):
         """Estimate the first velocities and attach the moving candidates to anchors."""
         if previous.colors is None or current.colors is None or current.normals is None:
             raise ValueError("the inertial dynamics needs observed colors and normals; set encoder.use_normals=true")
+        with torch.autocast(current.positions.device.type, enabled=False):  # geometry in full precision
+            return self._first_memory(previous, current)
+
+    def _first_memory(self, previous: Particles, current: Particles) -> InertialMemory:
+        previous, current = _with_a_slot(previous), _with_a_slot(current)
         movable = self._movable(current)
         index, mask = _gather_index(movable)
         positions = _take(current.positions, index)
@@ -171,6 +176,8 @@ class InertialDynamics(AbstractDynamics):
         self, previous: Particles, current: Particles, memory: Any, keys: RandomKeys, rollout_step: int
     ) -> tuple[Particles, InertialMemory]:
         """Advance one step; see the class."""
+        if current.num_particles == 0:
+            return current, memory
         device_type = current.positions.device.type
         with torch.autocast(device_type, enabled=False):  # geometry in full precision
             return self._step(current, memory)
@@ -228,6 +235,15 @@ class InertialDynamics(AbstractDynamics):
         static = static + self.static_shading(static, memory.static_surroundings, surroundings)
         features = _put(current.features, memory.index, moving, memory.mask)
         return _put(features, memory.static_index, static, memory.static_mask)
+
+
+def _with_a_slot(particles: Particles) -> Particles:
+    """Return the particles with one slot of padding where they have no slots at all."""
+    if particles.num_particles > 0:
+        return particles
+    slots = {item.name: getattr(particles, item.name) for item in fields(particles)}
+    shapes = {name: (len(value), 1, *value.shape[2:]) for name, value in slots.items() if value is not None}
+    return Particles(**{name: slots[name].new_zeros(shape) for name, shape in shapes.items()})
 
 
 def _gather_index(chosen: Bool[Tensor, "batch particle"]) -> tuple[Tensor, Tensor]:

@@ -43,8 +43,8 @@ class UNetNetwork(nn.Module):
     ) -> Float[Tensor, "particle feature"]:
         """Return the output at the chosen pixels (flat index over image, row, column): equal to ``forward`` there.
 
-        The last convolution is the most expensive one, and most pixels become no particle: it is evaluated where one
-        is, from gathered 3x3 patches, and its input is never up-sampled.
+        The last convolution is the most expensive one. Where few pixels become particles it pays to evaluate it only
+        there, from gathered 3x3 patches; its input is never up-sampled.
         """
         x, skip = self._all_but_last(images)
         height, width = skip.shape[-2:]

@@ -16,15 +16,21 @@ def depth_normals(
     Each image axis uses whichever one-sided difference crosses the smaller depth step, so that a normal beside an
     occlusion edge belongs to its own surface.
     """
-    points = unproject(torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0), cameras)
-    valid = torch.isfinite(depth) & (depth > 0)
+    # A missing neighbour must count as a large step; comparisons with NaN would choose it.
+    depth = torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
+    points = unproject(depth, cameras)
+    valid = depth > 0
 
     def tangent(axis: int) -> Tensor:
+        """Return the smaller step along an image axis; zero, hence no normal, where both neighbours are missing."""
+        ahead, behind = torch.roll(depth, -1, axis), torch.roll(depth, 1, axis)
+        forward_step = (ahead - depth).abs().masked_fill(ahead <= 0, torch.inf)
+        backward_step = (behind - depth).abs().masked_fill(behind <= 0, torch.inf)
         forward = torch.roll(points, -1, axis - 1) - points  # axis counts without the trailing coordinate axis
         backward = points - torch.roll(points, 1, axis - 1)
-        forward_step = (torch.roll(depth, -1, axis) - depth).abs()
-        backward_step = (torch.roll(depth, 1, axis) - depth).abs()
-        return torch.where((forward_step <= backward_step)[..., None], forward, backward)
+        chosen = torch.where((forward_step <= backward_step)[..., None], forward, backward)
+        known = torch.isfinite(torch.minimum(forward_step, backward_step))
+        return chosen * known[..., None]
 
     normals = torch.linalg.cross(tangent(-2), tangent(-1))
     length = normals.norm(dim=-1, keepdim=True)

@@ -52,6 +52,15 @@ def ray_candidates(particles: Particles, rays: Rays, num_candidates: int, near: 
         return RayCandidates(along, across, gathered[..., 3:], mask)
 
 
+def require_finite(*tensors: Tensor) -> None:
+    """Raise NonFiniteError unless positions and rays are finite; one pass over each, no copy of a mask."""
+    if not bool(torch.isfinite(sum(tensor.sum() for tensor in tensors))):  # type: ignore[arg-type]
+        raise NonFiniteError(
+            "Rendering: a particle position or a ray is NaN or infinite.\n"
+            "A model that diverged, or damaged poses; lower the learning rate or check the data with vpd-data validate."
+        )
+
+
 @torch.no_grad()
 def _closest(
     positions: Float[Tensor, "batch particle 3"],
@@ -63,12 +72,7 @@ def _closest(
     far: float,
 ) -> tuple[Tensor, Bool[Tensor, "batch ray candidate"]]:
     positions = torch.where(valid[..., None], positions, 0.0)
-    total = positions.sum() + origins.sum() + directions.sum()
-    if not bool(torch.isfinite(total)):
-        raise NonFiniteError(
-            "Rendering: a particle position or a ray is NaN or infinite.\n"
-            "A model that diverged, or damaged poses; lower the learning rate or check the data with vpd-data validate."
-        )
+    require_finite(positions, origins, directions)
     batch_size, num_particles = positions.shape[:2]
     num_rays = origins.shape[1]
     index = torch.zeros((batch_size, num_rays, num_candidates), dtype=torch.int64, device=positions.device)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
+from vpd_lightning.renderer.ray_candidates import require_finite
 from vpd_lightning.types import Particles, Rays, RenderedRays
 
 
@@ -59,6 +60,13 @@ class SplatRenderer(AbstractRenderer):
     def forward(self, particles: Particles, rays: Rays, keys: RandomKeys | None) -> RenderedRays:
         """Render rays (``batch ray 3``); nothing here is random, so ``keys`` is not used."""
         num_rays = rays.origins.shape[1]
+        if particles.num_particles == 0:  # maxima and products need something to work on
+            pad = nn.functional.pad
+            particles = Particles(
+                positions=pad(particles.positions, (0, 0, 0, 1)),
+                features=pad(particles.features, (0, 0, 0, 1)),
+                mask=pad(particles.mask, (0, 1)),
+            )
         chunks = [
             self._render(
                 particles, rays.origins[:, s : s + self.ray_chunk_size], rays.directions[:, s : s + self.ray_chunk_size]
@@ -101,11 +109,7 @@ class SplatRenderer(AbstractRenderer):
         usable = gather(particles.mask[..., None]).squeeze(-1) & (along > self.near)
         features = gather(particles.features)
 
-        # Distance of the front: the nearest candidate, each set back by how far it is beside the ray.
-        with torch.no_grad():
-            set_back = along + 2 * square.sqrt()
-            first = set_back.masked_fill(~usable, self.far).amin(dim=-1, keepdim=True)
-        in_front = (first + self.layer_depth - along) / (0.3 * self.layer_depth)
+        in_front = (self._front(along, square, usable) + self.layer_depth - along) / (0.3 * self.layer_depth)
         inputs, depths = [], []
         for membership in (nn.functional.logsigmoid(in_front), nn.functional.logsigmoid(-in_front)):
             membership = membership.masked_fill(~usable, -30.0).clamp(min=-30.0)
@@ -121,12 +125,23 @@ class SplatRenderer(AbstractRenderer):
             inputs.append(torch.log1p(membership.exp().sum(dim=-1, keepdim=True)))
         return torch.cat(inputs, dim=-1), torch.cat(depths, dim=-1)
 
+    @torch.no_grad()
+    def _front(self, along: Tensor, square: Tensor, usable: Tensor) -> Float[Tensor, "batch ray 1"]:
+        """Return where the front begins: the nearest candidate, each set back by how far it is beside the ray.
+
+        It only places the soft border between the two layers, so no gradient passes through it.
+        """
+        set_back = along + 2 * square.sqrt()
+        return set_back.masked_fill(~usable, self.far).amin(dim=-1, keepdim=True)
+
     def _candidates(
         self, particles: Particles, origins: Tensor, directions: Tensor
     ) -> Int[Tensor, "batch ray candidate"]:
         """Choose the particles closest to each ray; those behind the camera, hidden or padded come last."""
-        center = particles.positions.mean(dim=1, keepdim=True)
-        positions, eyes = particles.positions - center, origins - center
+        known = torch.where(particles.mask[..., None], particles.positions, 0.0)
+        require_finite(known, origins, directions)
+        center = known.mean(dim=1, keepdim=True)
+        positions, eyes = known - center, origins - center
         index = [
             torch.cat(
                 [
