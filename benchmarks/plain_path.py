@@ -1,4 +1,4 @@
-"""The plain way to do the same: brute-force neighbours, concatenated edge inputs, one render call per time step.
+"""The plain way to do the same: every pair written down, concatenated edges, dense convolutions, a render call a step.
 
 Same weights, same draws, same results up to the order of sums. What it leaves out is what the fast path does.
 """
@@ -13,8 +13,10 @@ from torch import Tensor
 
 from benchmarks.measuring import replaced
 from vpd_lightning.dynamics.blocks import EdgeUpdater
+from vpd_lightning.encoder import unet
 from vpd_lightning.graph.neighbors import search
 from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.renderer.splat import SplatRenderer
 from vpd_lightning.simulator import Simulator
 from vpd_lightning.types import Particles, Rays, RenderedRays
 
@@ -32,6 +34,19 @@ def concatenated_edges(
     if receiver_nodes is not None:
         inputs.append(receiver_nodes.index_select(0, receivers))
     return edges + self.norm(self.mlp(torch.cat(inputs, dim=-1)))
+
+
+def splat_candidates(self: SplatRenderer, particles: Particles, origins: Tensor, directions: Tensor) -> Tensor:
+    """Choose a ray's candidates from explicit differences to all particles, and sort them by one big selection."""
+    offsets = particles.positions[:, None] - origins[:, :, None]
+    along = (offsets * directions[:, :, None]).sum(dim=-1)
+    square = (offsets - along[..., None] * directions[:, :, None]).square().sum(dim=-1)
+    square = square + 1e6 * ~particles.mask[:, None]
+    along = along + 1e4 * (self.near - along).clamp(min=0)
+    beside = (square - (0.5 * self.kernel_scales[-1]) ** 2).clamp(min=0)
+    first = (along + 1e4 * beside).amin(dim=-1, keepdim=True)
+    score = square + 0.04 * (along - first - 3 * self.layer_depth).clamp(min=0).square()
+    return score.topk(min(self.num_candidates, particles.num_particles), dim=-1, largest=False).indices
 
 
 def _brute_force(*_: Any, **__: Any) -> str:
@@ -54,6 +69,8 @@ def plain(simulator: Simulator, num_steps: int) -> Iterator[None]:
     with ExitStack() as stack:
         stack.enter_context(replaced(search, "automatic_backend", _brute_force))
         stack.enter_context(replaced(EdgeUpdater, "forward", concatenated_edges))
+        stack.enter_context(replaced(unet, "_GATHER_BELOW", 0.0))
+        stack.enter_context(replaced(SplatRenderer, "_candidates", splat_candidates))
         stack.enter_context(replaced(simulator.renderer, "forward", one_step_per_call))
         yield
 

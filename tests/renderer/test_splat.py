@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from benchmarks.plain_path import splat_candidates
 from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.renderer.splat import SplatRenderer, smallest
 from vpd_lightning.types import Particles, Rays
@@ -145,6 +146,17 @@ def test_rays_through_a_particle_and_duplicates_stay_finite():
     model(same, lines, None).rgbs.sum().backward()
 
     assert torch.isfinite(same.positions.grad).all()
+
+
+def test_blocked_search_finds_the_candidates_of_the_plain_one():
+    model = renderer(num_candidates=24)
+    scene, lines = particles(count=700), rays(count=300)
+    scene = Particles(scene.positions, scene.features, torch.arange(700).expand(2, 700) % 7 > 0)
+
+    fast = model._candidates(scene, lines.origins, lines.directions)
+    plain = splat_candidates(model, scene, lines.origins, lines.directions)
+
+    assert torch.equal(fast.sort(dim=-1).values, plain.sort(dim=-1).values)
 
 
 def test_a_particle_that_is_not_finite_is_refused_by_name():

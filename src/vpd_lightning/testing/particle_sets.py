@@ -1,0 +1,70 @@
+"""The same particles in another form: other slots, padding, a shifted world, one member, fewer of them."""
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from vpd_lightning.types import Particles, Rays
+
+SHIFT = (3.0, -2.0, 1.0)  # metres
+_NUM_PADDING = 3  # slots before the particles, and as many behind them
+
+
+def mapped(particles: Particles, function: Callable[[Tensor], Tensor]) -> Particles:
+    """Apply a function to every tensor of the particles."""
+    changed = {item.name: getattr(particles, item.name) for item in fields(particles)}
+    return Particles(**{name: None if value is None else function(value) for name, value in changed.items()})
+
+
+def member(particles: Particles, index: int) -> Particles:
+    """Return one member of the batch, as a batch of one."""
+    return mapped(particles, lambda values: values[index : index + 1])
+
+
+def reordered(particles: Particles, order: Int[Tensor, " particle"]) -> Particles:
+    """Return the particles in other slots."""
+    return mapped(particles, lambda values: values[:, order])
+
+
+def first(particles: Particles, count: int) -> Particles:
+    """Return the first slots only."""
+    return mapped(particles, lambda values: values[:, :count])
+
+
+def shifted(particles: Particles) -> Particles:
+    """Return the particles somewhere else in the world."""
+    return replace(particles, positions=particles.positions + particles.positions.new_tensor(SHIFT))
+
+
+def shifted_rays(rays: Rays) -> Rays:
+    """Return the rays at the place of the shifted particles."""
+    return Rays(rays.origins + rays.origins.new_tensor(SHIFT), rays.directions)
+
+
+def only_valid(particles: Particles, count: int) -> Particles:
+    """Return the particles with all but the first ``count`` slots as padding; what lies in the padding stays."""
+    mask = particles.mask & (torch.arange(particles.num_particles, device=particles.mask.device) < count)
+    return replace(particles, mask=mask)
+
+
+def padded(particles: Particles) -> Particles:
+    """Return the particles with padding before and behind them that holds large finite numbers."""
+
+    def with_padding(values: Tensor) -> Tensor:
+        shape = (values.shape[0], _NUM_PADDING, *values.shape[2:])
+        junk = torch.full(shape, 40.0 if values.is_floating_point() else True, dtype=values.dtype, device=values.device)
+        return torch.cat([junk, values, junk], dim=1)
+
+    wide = mapped(particles, with_padding)
+    mask = wide.mask.clone()
+    mask[:, :_NUM_PADDING] = False
+    mask[:, -_NUM_PADDING:] = False
+    return replace(wide, mask=mask)
+
+
+def without_padding(particles: Particles) -> Particles:
+    """Return the slots that ``padded`` did not add."""
+    return mapped(particles, lambda values: values[:, _NUM_PADDING:-_NUM_PADDING])

@@ -1,0 +1,334 @@
+"""Every encoder, dynamics, renderer and loss of conf/ keeps its contract; a new file is tested because it is there."""
+
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from vpd_lightning.config import build, build_list, compose, config_folder, load_plugins
+from vpd_lightning.dynamics.base import AbstractDynamics
+from vpd_lightning.dynamics.persistence import PersistenceDynamics
+from vpd_lightning.encoder.base import AbstractEncoder
+from vpd_lightning.losses.base import AbstractLoss
+from vpd_lightning.losses.pixel import PixelLoss
+from vpd_lightning.renderer.base import AbstractRenderer
+from vpd_lightning.renderer.splat import SplatRenderer
+from vpd_lightning.testing import (
+    FAR,
+    FEATURE_DIM,
+    IMAGE_SIZE,
+    NEAR,
+    NUM_VIEWS,
+    WORKSPACE_MAX,
+    WORKSPACE_MIN,
+    DynamicsContract,
+    EncoderContract,
+    LossContract,
+    RendererContract,
+)
+
+# Any option may hold any of these; where it does, the test takes the small value. All else stays as the file says.
+SMALL = {
+    "channels": [6, 8, 6, 8, FEATURE_DIM],
+    "num_particles": 30,
+    "num_views": NUM_VIEWS,
+    "height": IMAGE_SIZE,
+    "width": IMAGE_SIZE,
+    "hidden_dim": 12,
+    "message_passing_steps": 2,
+    "num_abstract_nodes": 12,
+    "net_depth": 3,
+    "net_width": 12,
+    "skip_layer": 1,
+    "net_width_condition": 8,
+    "num_coarse_samples": 12,
+    "num_fine_samples": 12,
+    "background_width": 8,
+    "ray_chunk_size": 10,  # fewer than the rays of a check, so that chunks are joined
+}
+SCENE = [
+    "scene=demo",
+    f"feature_dim={FEATURE_DIM}",
+    f"scene.near={NEAR}",
+    f"scene.far={FAR}",
+    f"scene.workspace_min={list(WORKSPACE_MIN)}",
+    f"scene.workspace_max={list(WORKSPACE_MAX)}",
+    "data.folder=nowhere",
+    "run.folder=nowhere",
+]
+# InertialDynamics sees the first num_probes and num_matched slots of what may move; beyond them the order of particles
+# does matter, so both stay above 20 here.
+
+# What a class cannot satisfy, by its name, so that a new option of the same class needs no entry.
+DEPARTURES = {
+    "HierarchicalGNNDynamics": {
+        "test_order_of_particles_does_not_matter": "abstract nodes are drawn among the slots of the current particles"
+    },
+}
+NEEDS_OBSERVATIONS = {"InertialDynamics"}
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
+
+
+@cache
+def composed(group: str, option: str) -> Any:
+    return compose("train", [f"{group}={option}", *SCENE])[group]
+
+
+def small(section: Any) -> Any:
+    if isinstance(section, Mapping):
+        return {key: SMALL[key] if key in SMALL else small(value) for key, value in section.items()}
+    return section
+
+
+class ChosenOption:
+    """Builds the option that a test is parametrised with."""
+
+    group: str
+    base: type
+
+    def choose(self, option: str) -> None:
+        self.section = small(composed(self.group, option))
+        self.class_name = self.section.get("_target_", "").rpartition(".")[2]
+        self.departures = DEPARTURES.get(self.class_name, {})
+
+    def build(self) -> Any:
+        return build(self.section, self.base, self.group)
+
+
+class TestEncoders(ChosenOption, EncoderContract):
+    group, base = "encoder", AbstractEncoder
+
+    @pytest.fixture(params=options("encoder"), autouse=True)
+    def _option(self, request: pytest.FixtureRequest) -> None:
+        self.choose(request.param)
+
+
+class TestDynamics(ChosenOption, DynamicsContract):
+    group, base = "dynamics", AbstractDynamics
+
+    @pytest.fixture(params=options("dynamics"), autouse=True)
+    def _option(self, request: pytest.FixtureRequest) -> None:
+        self.choose(request.param)
+        self.needs_observations = self.class_name in NEEDS_OBSERVATIONS
+
+
+class TestPaperDynamicsWithoutDraws(TestDynamics):
+    """With as many abstract nodes as particles nothing is drawn, and the paper's network departs from nothing."""
+
+    @pytest.fixture(params=[name for name in options("dynamics") if name.startswith("hierarchical_gnn")], autouse=True)
+    def _option(self, request: pytest.FixtureRequest) -> None:
+        self.choose(request.param)
+        self.section["num_abstract_nodes"] = 64
+        self.departures = {}
+
+
+class TestRenderers(ChosenOption, RendererContract):
+    group, base = "renderer", AbstractRenderer
+
+    @pytest.fixture(params=options("renderer"), autouse=True)
+    def _option(self, request: pytest.FixtureRequest) -> None:
+        self.choose(request.param)
+
+
+class TestLosses(ChosenOption, LossContract):
+    group, base = "loss", AbstractLoss
+
+    @pytest.fixture(params=options("loss"), autouse=True)
+    def _option(self, request: pytest.FixtureRequest) -> None:
+        self.choose(request.param)
+
+    def build(self) -> Any:
+        losses = build_list(self.section, AbstractLoss, "loss")
+        assert len(losses) == 1, "one contract test holds one loss; test the others through options of their own"
+        return losses[0]
+
+
+# The contracts themselves: each fault must be found by the check that is named beside it.
+
+
+class Drifting(AbstractDynamics):
+    """Keeps the contract: everything moves by the mean of the features, learned and a little random."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.step = torch.nn.Linear(FEATURE_DIM, 3)
+
+    def forward(self, previous: Any, current: Any, memory: Any, keys: Any, rollout_step: int) -> Any:
+        draws = [torch.rand(3, generator=generator) for generator in keys.generators(f"drift/{rollout_step}")]
+        step = self.step(current.features) * (1 + torch.stack(draws)[:, None].to(current.positions))
+        return replace(current, positions=current.positions + step), memory
+
+
+class DrawsGlobally(Drifting):
+    def forward(self, previous: Any, current: Any, *more: Any) -> Any:
+        following, memory = super().forward(previous, current, *more)
+        return replace(following, positions=following.positions + torch.rand_like(following.positions)), memory
+
+
+class ChangesItsInput(Drifting):
+    def forward(self, previous: Any, current: Any, *more: Any) -> Any:
+        current.features[:, 0] *= 0.5
+        return super().forward(previous, current, *more)
+
+
+class SeesTheOrigin(Drifting):
+    def forward(self, previous: Any, current: Any, *more: Any) -> Any:
+        following, memory = super().forward(previous, current, *more)
+        return replace(following, positions=0.9 * following.positions), memory
+
+
+class SeesPadding(Drifting):
+    def forward(self, previous: Any, current: Any, *more: Any) -> Any:
+        following, memory = super().forward(previous, current, *more)
+        mean = following.features.mean(dim=1, keepdim=True)
+        return replace(following, features=following.features + mean), memory
+
+
+class SeesItsNeighborsInTheBatch(Drifting):
+    def forward(self, previous: Any, current: Any, *more: Any) -> Any:
+        following, memory = super().forward(previous, current, *more)
+        return replace(following, features=following.features + following.features[:1, :1].detach()), memory
+
+
+class SeesSlots(Drifting):
+    def forward(self, previous: Any, current: Any, *more: Any) -> Any:
+        following, memory = super().forward(previous, current, *more)
+        return replace(following, features=following.features + following.mask.cumsum(dim=1)[..., None]), memory
+
+
+class RemembersInSecret(Drifting):
+    def initialize(self, previous: Any, current: Any, keys: Any) -> Any:
+        return lambda: current
+
+
+class NeverLearns(Drifting):
+    def forward(self, previous: Any, current: Any, *more: Any) -> Any:
+        return super().forward(previous, replace(current, features=current.features.detach()), *more)
+
+
+class LosesColors(Drifting):
+    def forward(self, previous: Any, current: Any, *more: Any) -> Any:
+        following, memory = super().forward(previous, current, *more)
+        return replace(following, colors=None), memory
+
+
+class SumLoss(PixelLoss):
+    def forward(self, output: Any, batch: Any) -> Any:
+        return (output.rendered.rgbs - batch.rgbs).square().sum()
+
+
+class UnevenRenderer(SplatRenderer):
+    def forward(self, particles: Any, rays: Any, keys: Any) -> Any:
+        rendered = super().forward(particles, rays, keys)
+        return replace(rendered, depths=rendered.depths - rendered.depths.mean())
+
+
+def contract_of(contract: type, make: Any, **attributes: Any) -> Any:
+    return type("OneContract", (contract,), {"build": lambda self: make(), **attributes})()
+
+
+def checks(contract: Any) -> list[str]:
+    return [name for name in dir(contract) if name.startswith("test_")]
+
+
+def test_faultless_dynamics_keeps_every_check() -> None:
+    contract = contract_of(DynamicsContract, Drifting)
+    for name in checks(contract):
+        getattr(contract, name)()
+
+
+@pytest.mark.parametrize(
+    ("faulty", "check"),
+    [
+        (DrawsGlobally, "test_same_keys_give_the_same_prediction_and_global_randomness_is_untouched"),
+        (ChangesItsInput, "test_inputs_and_memory_stay_as_they_are"),
+        (SeesTheOrigin, "test_moving_the_world_moves_the_prediction"),
+        (SeesPadding, "test_padding_changes_nothing"),
+        (SeesItsNeighborsInTheBatch, "test_a_batch_equals_its_members"),
+        (SeesSlots, "test_order_of_particles_does_not_matter"),
+        (RemembersInSecret, "test_memory_is_plain_and_can_be_rebuilt_in_the_middle_of_a_rollout"),
+        (NeverLearns, "test_every_weight_and_the_features_get_a_finite_gradient"),
+        (LosesColors, "test_carries_observations_along"),
+    ],
+)
+def test_faulty_dynamics_is_found_out(faulty: type, check: str) -> None:
+    with pytest.raises(AssertionError):
+        getattr(contract_of(DynamicsContract, faulty), check)()
+
+
+def test_loss_that_grows_with_the_batch_is_found_out() -> None:
+    contract = contract_of(LossContract, lambda: SumLoss(weight=1.0, coarse_weight=1.0))
+
+    with pytest.raises(AssertionError):
+        contract.test_a_batch_is_the_mean_of_its_members()
+
+
+def test_renderer_whose_rays_see_each_other_is_found_out() -> None:
+    contract = contract_of(RendererContract, lambda: UnevenRenderer(**without_target("renderer", "splat")))
+
+    with pytest.raises(AssertionError):
+        contract.test_a_ray_does_not_see_other_rays()
+
+
+def without_target(group: str, option: str) -> dict[str, Any]:
+    return {key: value for key, value in small(composed(group, option)).items() if key != "_target_"}
+
+
+def test_departure_that_is_none_must_not_be_declared() -> None:
+    departures = {"test_order_of_particles_does_not_matter": "nobody looked"}
+    contract = contract_of(DynamicsContract, PersistenceDynamics, departures=departures)
+
+    with pytest.raises(AssertionError, match="the check passes"):
+        contract.test_order_of_particles_does_not_matter()
+
+
+@pytest.mark.parametrize("name", ["test_padding_changes_nothing", "test_misspelt"])
+def test_only_checks_that_allow_it_can_be_departed_from(name: str) -> None:
+    contract = contract_of(DynamicsContract, PersistenceDynamics, departures={name: "too hard"})
+
+    with pytest.raises(AssertionError, match="possible are"):
+        contract.test_departures_are_declared_by_name()
+
+
+def test_contract_without_build_says_what_to_do() -> None:
+    with pytest.raises(NotImplementedError, match="must define build"):
+        EncoderContract().test_inputs_stay_as_they_are()
+
+
+GUIDE = Path(__file__).parents[1] / "docs" / "adding_a_component.md"
+# A file of the guide: its path in backquotes on a line of its own, then its content.
+LISTED_FILE = re.compile(r"^`([\w./]+)`\n\n```\w+\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def test_example_of_the_guide_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = dict(LISTED_FILE.findall(GUIDE.read_text()))
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(content)
+    assert 'plugins"]\nmy_lab = "my_lab"' in files["pyproject.toml"]
+    monkeypatch.syspath_prepend(tmp_path / "src")
+    monkeypatch.syspath_prepend(tmp_path / "tests")
+    entry = EntryPoint("my_lab", "my_lab", "vpd_lightning.plugins")
+    monkeypatch.setattr("vpd_lightning.config.plugins.entry_points", lambda group: [entry])
+    load_plugins.cache_clear()
+    try:
+        section = compose("train", ["experiment=tiny", "dynamics=drift"])["dynamics"]
+        assert type(build(section, AbstractDynamics, "dynamics")).__name__ == "DriftDynamics"
+        contract = import_module("test_drift").TestDrift()
+        for name in checks(contract):
+            getattr(contract, name)()
+    finally:
+        load_plugins.cache_clear()
+        for name in [name for name in sys.modules if name.partition(".")[0] in ("my_lab", "test_drift")]:
+            del sys.modules[name]
