@@ -20,7 +20,7 @@ STAMP := $(VENV)/.installed
 export MPLBACKEND = Agg
 
 .PHONY: help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
-	types imports cluster bench wheel clean
+	types imports cluster bench paper-step wheel clean
 
 help: ## List the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -92,6 +92,9 @@ cluster: $(STAMP) ## Build and install torch-cluster (needs a C++ compiler; 10 t
 bench: $(STAMP) ## Time one training step and one rendered frame against the plain path; writes benchmarks/results
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_step
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.render_frame
+
+paper-step: $(STAMP) ## Take one training step at the paper's size, one clip on the CPU: finite gradients, time, peak memory
+	$(BIN)/python -m benchmarks.paper_size_step --json benchmarks/results/paper_size_step_cpu.json
 
 wheel: $(STAMP) ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel
