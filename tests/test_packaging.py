@@ -1,15 +1,19 @@
 """The wheel works by itself: built, installed away from the repository, run from another folder."""
 
+import ast
 import os
 import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 import zipfile
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = ("vpd-data", "vpd-train", "vpd-eval", "vpd-render", "vpd-info")
@@ -52,6 +56,29 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     )  # fmt: skip
     assert result.returncode == 0, result.stdout + result.stderr
     return root / "bin"
+
+
+def test_everything_imported_is_required():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = {
+        Requirement(line).name for line in (*project["dependencies"], *project["optional-dependencies"]["cluster"])
+    }
+    imported = set()
+    for path in [*(ROOT / "src").rglob("*.py"), *(ROOT / "data_gen").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                imported.add(node.module.partition(".")[0])
+    own = {"vpd_lightning", "data_gen", "pytest"}  # the contract tests in vpd_lightning.testing run under pytest
+    packages = {"torch_cluster": ["torch-cluster"], **packages_distributions()}
+    missing = {
+        name
+        for name in imported - own - sys.stdlib_module_names
+        if not required & {found.replace("_", "-").lower() for found in packages.get(name, [])}
+    }
+
+    assert not missing
 
 
 @pytest.mark.slow

@@ -199,6 +199,37 @@ def test_folder_that_holds_a_run_already(quick: list[str], trained: Path, in_fol
     assert {path: path.stat().st_mtime_ns for path in trained.rglob("*")} == before
 
 
+@pytest.mark.parametrize("more", [[], ["resume=auto"]])
+def test_folder_that_holds_something_else(quick: list[str], more: list[str], in_folder: Path, fails: Fails):
+    (in_folder / "here").mkdir()
+    (in_folder / "here" / "thesis.tex").touch()
+    (in_folder / "here" / "log.txt").touch()
+
+    message = fails(train.main, [*quick, "run.folder=here", *more], 2)
+
+    assert "holds no checkpoint to go on from, but what no training starts with: thesis.tex" in message
+    assert {path.name for path in (in_folder / "here").iterdir()} == {"thesis.tex", "log.txt"}
+
+
+def test_folder_that_is_a_file(quick: list[str], in_folder: Path, fails: Fails):
+    (in_folder / "here").touch()
+
+    assert "run.folder=here is a file" in fails(train.main, [*quick, "run.folder=here", "resume=auto"], 2)
+
+
+def test_folder_of_a_run_that_died_before_a_checkpoint(quick: list[str], in_folder: Path, fails: Fails):
+    (in_folder / "here" / "checkpoints").mkdir(parents=True)
+    (in_folder / "here" / "log.txt").touch()
+
+    message = fails(train.main, [*quick, "run.folder=here"], 2)
+
+    assert "resume=auto" in message and "here.aborted-N" in message
+    assert "resume=here" not in message
+    # A mistake elsewhere moves nothing.
+    fails(train.main, [*quick, "run.folder=here", "resume=auto", "encoder._target_=os.system"], 2)
+    assert {path.name for path in in_folder.iterdir()} == {"here"}
+
+
 # Words for vpd-eval and vpd-render beside a good checkpoint.
 COMMANDS = {"vpd-eval": eval.main, "vpd-render": render.main}
 

@@ -1,5 +1,6 @@
 """The data of a training: loaders, ranks, resuming, validation clips, backgrounds, and what is refused."""
 
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import torch
 
 from tests.data.recordings import make_trajectory, write_dataset_file, write_recordings
 from tests.training.tiny_training import tiny_data, tiny_module, tiny_trainer
+from vpd_lightning.data.background import median_images
+from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.sampler import StepBatchSampler
 from vpd_lightning.data.schema import write_trajectory
 from vpd_lightning.errors import ConfigError, DataError
@@ -101,6 +104,25 @@ def test_the_background_is_the_median_of_the_training_images(folder: Path) -> No
     np.testing.assert_array_equal(rgb[0].numpy(), floor)
     assert (depth == 1.5).all()
     assert cameras.shape == (1,) and cameras.cam_to_world[0, 0, 3] == pytest.approx(0.1)
+
+
+def test_the_median_of_a_view_is_taken_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[list[int]] = []
+
+    def counted(trajectories: Sequence[TrajectoryFrames], views: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        asked.append(list(views))
+        return median_images(trajectories, views)
+
+    monkeypatch.setattr("vpd_lightning.data.datamodule.median_images", counted)
+    data = tiny_data(folder, input_views=[1], target_views=[1, 0], moving_ray_fraction=0.5)
+    background = data.median_background()
+    data.clip_dataset(max_steps=1)
+    data.clip_dataset(max_steps=1)
+    assert asked == [[1], [0]]
+    rgb, depth, _ = data.median_background([1, 0, 1])
+    expected_rgb, expected_depth = median_images(data.trajectories, [1, 0, 1])
+    assert np.array_equal(rgb.numpy(), expected_rgb) and np.array_equal(depth.numpy(), expected_depth)
+    assert torch.equal(background[0], rgb[:1])
 
 
 def test_pixels_without_a_measurement_do_not_count_as_background_depth(tmp_path: Path) -> None:

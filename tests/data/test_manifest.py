@@ -41,7 +41,8 @@ def test_unknown_or_empty_split_names_those_there_are(folder: Path):
     [
         ("mujoco_block_tiny", "scene=mujoco_block preset=tiny out="),
         ("mujoco_block_paper", "scene=mujoco_block preset=paper out="),
-        ("anything", "scene=mujoco_block preset=demo out="),
+        ("mujoco_block", "scene=SCENE preset=PRESET out="),
+        ("anything", "scene=SCENE preset=PRESET out="),
     ],
 )
 def test_missing_data_set_is_told_with_the_command_that_makes_it(tmp_path: Path, name: str, command: str):

@@ -1,12 +1,16 @@
+from dataclasses import asdict
+
 import numpy as np
 import pytest
+import torch
 
 from data_gen import mujoco_block
-from data_gen.settings import load_settings, preset_names
+from data_gen.settings import differences, load_settings, preset_names
 from tests.data_gen.blocks import small_scene
 from vpd_lightning.data.ground_truth import GroundTruth
 from vpd_lightning.data.schema import Trajectory
 from vpd_lightning.errors import ConfigError
+from vpd_lightning.metrics.rigid_motion import rotation_matrix
 
 VIEW_SIZE = {"camera.height": 48, "camera.width": 64}
 TOLERANCE = 1e-4  # m; the bound. Float32 depth alone is good to 5e-7 m at 8 m
@@ -45,9 +49,13 @@ def state_of(trajectory: Trajectory) -> GroundTruth:
     return GroundTruth(**trajectory.state)
 
 
+def rotations_of(state: GroundTruth) -> np.ndarray:
+    return rotation_matrix(torch.from_numpy(state.quaternions)).numpy()
+
+
 def check_depth(trajectory: Trajectory) -> None:
     state = state_of(trajectory)
-    rotations, seen = state.rotations(), 0
+    rotations, seen = rotations_of(state), 0
     for time in range(0, len(trajectory.depth), 3):
         for view in range(trajectory.depth.shape[1]):
             points, label = unproject(trajectory, time, view), state.segmentation[time, view]
@@ -82,7 +90,8 @@ def test_velocities_are_in_the_world_frame(scene):
     step = fast.settings.frame_time
     moved = (state.positions[1:] - state.positions[:-1]) / step
     np.testing.assert_allclose(moved, state.linear_velocities[1:], atol=1e-6)  # semi-implicit Euler: v after the step
-    turn = state.rotations()[1:] @ np.swapaxes(state.rotations()[:-1], -1, -2)
+    rotations = rotations_of(state)
+    turn = rotations[1:] @ np.swapaxes(rotations[:-1], -1, -2)
     rate = np.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], -1) / step
     np.testing.assert_allclose(rate, state.angular_velocities[1:], atol=2e-3 * np.abs(rate).max())
 
@@ -128,6 +137,15 @@ def test_paper_preset_has_the_papers_numbers():
 
 def test_there_are_three_presets():
     assert preset_names("mujoco_block") == ["demo", "paper", "tiny"]
+
+
+def test_tiny_preset_is_the_demos_at_a_smaller_size():
+    demo, tiny = (asdict(load_settings(mujoco_block.Settings, "mujoco_block", name, {})) for name in ("demo", "tiny"))
+
+    assert {line.split(":")[0] for line in differences(demo, tiny)} == {
+        "splits.train", "splits.validation", "splits.test",
+        "num_frames", "camera.num_views", "camera.height", "camera.width",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

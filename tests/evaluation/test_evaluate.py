@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from tests.evaluation.conftest import protocol_with
 from tests.evaluation.tossed_box import NUM_FRAMES, NUM_VIEWS, SIZE, Oracle
@@ -17,7 +18,7 @@ from vpd_lightning.errors import ConfigError, DataError
 from vpd_lightning.evaluation.evaluate import evaluate
 from vpd_lightning.evaluation.images import moving_pixels
 from vpd_lightning.evaluation.protocol import Protocol, read_clip, read_clips
-from vpd_lightning.evaluation.references import mean_displacements, training_mean
+from vpd_lightning.evaluation.references import geometric_median, median_displacements, training_mean
 from vpd_lightning.evaluation.report import metrics_of
 from vpd_lightning.metrics.psnr import PSNR_CAP
 from vpd_lightning.simulator import Scene
@@ -90,6 +91,19 @@ def test_what_is_not_a_number_is_said_and_has_no_error(
     assert metrics["chamfer"]["per_step"][2] is None
 
 
+def test_model_and_constant_are_compared_over_the_clips_that_have_both(
+    manifest: Manifest, protocol: Protocol, test_paths: list[Path]
+) -> None:
+    evaluation = evaluate(Shifted(test_paths), manifest, protocol, [0])
+    lost = {**evaluation.motion, "centroid_error": evaluation.motion["centroid_error"].copy()}
+    hardest = evaluation.motion["centroid_error_constant"][..., 3].argmax()
+    lost["centroid_error"][hardest, :, 3] = np.nan
+    ratio = metrics_of(replace(evaluation, motion=lost), protocol, {})["motion"]["centroid_error_over_constant"]
+    others = np.delete(evaluation.motion["centroid_error_constant"][..., 3], hardest)
+    assert ratio["per_step"][3] == pytest.approx(0.05 / others.mean())
+    assert ratio["count"] == evaluation.motion["centroid_error"].size - 1
+
+
 def test_copying_the_last_input_frame_is_compared_frame_by_frame(
     manifest: Manifest, protocol: Protocol, test_paths: list[Path]
 ) -> None:
@@ -115,12 +129,42 @@ def test_training_mean_is_the_mean_of_all_training_frames(manifest: Manifest) ->
     np.testing.assert_allclose(training_mean(manifest.split("train")).numpy(), expected, atol=1e-6)
 
 
-def test_best_constant_is_the_mean_displacement_of_the_training_set(manifest: Manifest) -> None:
+def test_best_constant_is_the_geometric_median_of_the_training_displacements(manifest: Manifest) -> None:
     positions = [read_state(path).positions[:, 0] for path in manifest.split("train")]
-    expected = np.mean([p[4:8] - p[3] for p in positions], axis=0)
-    means = mean_displacements(manifest.split("train"), [2, NUM_FRAMES], num_steps=4)
-    np.testing.assert_allclose(means[2][:, 0].numpy(), expected)
-    assert NUM_FRAMES not in means  # no training trajectory is long enough
+    displacements = np.stack([p[4:8] - p[3] for p in positions])
+    constants = median_displacements(manifest.split("train"), [2, NUM_FRAMES], num_steps=4)
+    np.testing.assert_allclose(constants[2][:, 0].numpy(), geometric_median(displacements))
+    assert NUM_FRAMES not in constants  # no training trajectory is long enough
+
+
+def mean_distance(points: np.ndarray, constant: np.ndarray) -> float:
+    return float(np.linalg.norm(points - constant, axis=-1).mean())
+
+
+@pytest.mark.parametrize("outlier", [0.0, 5.0])
+def test_no_constant_has_a_smaller_mean_distance_than_the_geometric_median(outlier: float) -> None:
+    random = np.random.default_rng(0)
+    points = random.normal(size=(15, 2, 3)) + [0.3, -1.0, 0.2]
+    points[0] += outlier
+    medians = geometric_median(points)
+    for index, median in enumerate(medians):
+        found = minimize(lambda x, p=points[:, index]: mean_distance(p, x), points[:, index].mean(0), tol=1e-12)
+        assert mean_distance(points[:, index], median) < found.fun + 1e-5
+        tried = median + random.normal(size=(1000, 3)) * random.choice([1e-3, 1e-2, 0.1, 1.0], size=(1000, 1))
+        best = min(mean_distance(points[:, index], x) for x in (*tried, *points[:, index]))
+        assert mean_distance(points[:, index], median) < best + 1e-5
+        assert mean_distance(points[:, index], median) < mean_distance(points[:, index], points[:, index].mean(0))
+
+
+def test_geometric_median_leaves_a_point_that_is_not_it_and_finds_one_that_is() -> None:
+    # The mean of the first set, where the iteration starts, lies on one of its points.
+    off = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0.1, 0], [1, -0.1, 0], [-3, 0, 0]])
+    assert geometric_median(off)[0] == pytest.approx(
+        minimize(lambda x: mean_distance(off, x), [0.5, 0.01, 0.01], method="Nelder-Mead", tol=1e-10).x[0], abs=2e-3
+    )
+    most = np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [1, 0, 0], [0, 4, 0]])
+    np.testing.assert_allclose(geometric_median(most), 0, atol=1e-3)
+    np.testing.assert_allclose(geometric_median(np.ones((1, 3))), 1)
 
 
 def test_moving_pixels_without_segmentation_come_from_colour(test_paths: list[Path], protocol: Protocol) -> None:

@@ -149,7 +149,7 @@ def _one_place(verb: str, places: Sequence[str]) -> Path:
         raise ConfigError(f"{verb} takes one folder or .h5 file: vpd-data {verb} datasets/mujoco_block_demo")
     path = Path(places[0]).expanduser()
     if not path.exists():
-        raise DataError(f"There is no {path}.\nMake one: vpd-data generate scene=mujoco_block preset=demo out={path}")
+        raise DataError(f"There is no {path}.\nMake one: vpd-data generate; vpd-data --help says how.")
     return path
 
 

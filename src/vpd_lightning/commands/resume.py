@@ -15,7 +15,8 @@ def resumed_overrides(overrides: Sequence[str]) -> list[str]:
     """Return the overrides of the run to go on with, followed by the new ones; without ``resume``, the given ones.
 
     ``resume=FOLDER`` names a run folder, ``resume=last`` the youngest one (of the experiment, where one is given),
-    ``resume=auto`` goes on with ``run.folder`` where that holds a checkpoint and starts it otherwise.
+    ``resume=auto`` goes on with ``run.folder`` where that holds a checkpoint and starts it otherwise (the caller makes
+    room where a run died there before its first checkpoint).
 
     Raises:
         ConfigError: ``resume=auto`` without ``run.folder``.
@@ -25,17 +26,17 @@ def resumed_overrides(overrides: Sequence[str]) -> list[str]:
     wanted = _unquote(given.get("resume", "null"))
     if wanted in ("null", ""):
         return list(overrides)
-    if wanted == "auto":
+    if wants_auto(overrides):
         if "run.folder" not in given:
             raise ConfigError("resume=auto needs to know the folder.\nAdd run.folder=FOLDER, or use resume=last.")
-        folder = Path(_unquote(given["run.folder"]))
-        if not _has_checkpoint(folder):
+        folder = Path(_unquote(given["run.folder"])).expanduser()
+        if not has_checkpoint(folder):
             return [word for word in overrides if not word.startswith("resume=")]
     elif wanted == "last":
         folder = _youngest_run(Path(_unquote(given.get("run.root", "runs"))), given.get("experiment"))
     else:
         folder = Path(wanted).expanduser()
-    if not _has_checkpoint(folder):
+    if not has_checkpoint(folder):
         raise CheckpointError(
             f"there is nothing to resume in {folder}.\nIt holds no checkpoints/last.ckpt.\n"
             "Name the folder of a run (resume=runs/EXPERIMENT/RUN), or leave resume away to start anew."
@@ -45,7 +46,13 @@ def resumed_overrides(overrides: Sequence[str]) -> list[str]:
     return [f"{key}={value}" for key, value in merged.items()]
 
 
-def _has_checkpoint(folder: Path) -> bool:
+def wants_auto(overrides: Sequence[str]) -> bool:
+    """Whether the words say ``resume=auto``."""
+    return _unquote(_as_mapping(overrides).get("resume", "null")) == "auto"
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a run folder holds a checkpoint to go on from."""
     from vpd_lightning.training.checkpoint_io import LAST, PREVIOUS
     from vpd_lightning.training.checkpoints import FOLDER
 

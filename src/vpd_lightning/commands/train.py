@@ -31,7 +31,7 @@ def _train(argv: list[str]) -> int:
     if arguments.is_question:
         answer("train", argv)
         return 0
-    from vpd_lightning.commands.resume import resumed_overrides
+    from vpd_lightning.commands.resume import resumed_overrides, wants_auto
     from vpd_lightning.config import compose, expand_sweep
 
     overrides = resumed_overrides(arguments.overrides)
@@ -40,6 +40,8 @@ def _train(argv: list[str]) -> int:
     _check_places(configs, overrides, arguments)
     for words in jobs:
         _check_sections(compose("train", [*words, *_PROBE], arguments.config_dir))
+    if wants_auto(arguments.overrides):
+        _make_room(configs[0])
 
     failures: list[Exception] = []
 
@@ -80,8 +82,10 @@ def _check_sections(config: dict[str, Any]) -> None:
 
 def _check_places(configs: Sequence[dict[str, Any]], overrides: Sequence[str], arguments: Arguments) -> None:
     """Refuse run folders that exist, and runs that would share one."""
+    from vpd_lightning.commands.resume import wants_auto
+
     for config in configs:
-        _check_folder(config)
+        _check_folder(config, may_set_aside=wants_auto(arguments.overrides))
     if arguments.is_multirun:
         launcher = next((word for word in overrides if word.startswith("hydra/launcher=")), "")
         if "submitit" not in launcher:
@@ -96,16 +100,54 @@ def _check_places(configs: Sequence[dict[str, Any]], overrides: Sequence[str], a
         )
 
 
-def _check_folder(config: dict[str, Any]) -> None:
+def _check_folder(config: dict[str, Any], *, may_set_aside: bool) -> None:
+    """Refuse a run folder that holds something, but for a start without a checkpoint that ``resume=auto`` may move."""
+    from vpd_lightning.commands.resume import has_checkpoint
+    from vpd_lightning.commands.run_claim import foreign_files, is_claimed
+
     folder = config["run"]["folder"]
     if not folder or config["resume"] or not _is_rank_zero():
         return
     path = Path(folder).expanduser()
-    if path.is_file() or (path.is_dir() and any(path.iterdir())):
+    if path.is_file():
+        raise ConfigError(f"run.folder={folder} is a file.\nName a folder, or leave run.folder away.")
+    if not _holds_something(path):
+        return
+    exists = f"run.folder={folder} exists already, and nothing is overwritten.\n"
+    other = "name another folder; or leave run.folder away."
+    if has_checkpoint(path):
+        raise ConfigError(f"{exists}Go on with it: resume={folder}; or {other}")
+    if is_claimed(path):
         raise ConfigError(
-            f"run.folder={folder} exists already, and nothing is overwritten.\n"
-            f"Go on with it: resume={folder}; or name another folder; or leave run.folder away."
+            f"a run that is still going has taken run.folder={folder}; it has saved no checkpoint yet.\n"
+            f"Wait for it or stop it; or {other}"
         )
+    if foreign := foreign_files(path):
+        shown = ", ".join(foreign[:3]) + (", ..." if len(foreign) > 3 else "")
+        raise ConfigError(
+            f"{exists}It holds no checkpoint to go on from, but what no training starts with: {shown}.\n"
+            f"{other.capitalize()}"
+        )
+    if not may_set_aside:
+        raise ConfigError(
+            f"{exists}It holds no checkpoint to go on from: a run ended there before it saved one.\n"
+            f"Start anew in it with resume=auto (what is there moves to {folder}.aborted-N); or delete it; or {other}"
+        )
+
+
+def _make_room(config: dict[str, Any]) -> None:
+    """Move a start without a checkpoint out of the way of the next one; ``_check_folder`` has looked at it."""
+    from vpd_lightning.commands.run_claim import set_aside
+
+    folder = config["run"]["folder"]
+    if config["resume"] or not _is_rank_zero() or not _holds_something(Path(folder).expanduser()):
+        return
+    target = set_aside(Path(folder).expanduser())
+    print(f"a run ended in {folder} before it saved a checkpoint; what it left is now in {target}", flush=True)
+
+
+def _holds_something(folder: Path) -> bool:
+    return folder.is_dir() and any(folder.iterdir())
 
 
 def _refuse_several_devices(trainer: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ import shutil
 import signal
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from lightning.pytorch.loggers import Logger
 
 from vpd_lightning.commands.environment import environment
 from vpd_lightning.commands.resume import OVERRIDES_FILE
+from vpd_lightning.commands.run_claim import claimed
 from vpd_lightning.config import build, build_list, build_simulator
 from vpd_lightning.data.manifest import FILE_NAME
 from vpd_lightning.errors import ConfigError, DataError, OutOfMemoryError
@@ -31,7 +32,6 @@ from vpd_lightning.training.optimization import AbstractOptimization
 
 CONFIG_FILE = "config.yaml"
 ENVIRONMENT_FILE = "environment.json"
-_CLAIM = ".claimed"
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +43,11 @@ def train_in(folder: Path, config: dict[str, Any], overrides: Sequence[str], *, 
         VPDError: whatever is wrong with configuration, data, checkpoint or memory.
     """
     is_new = is_rank_zero and not config["resume"]
-    if is_new:
-        _claim(folder)
+    with claimed(folder, is_new=is_new) if is_rank_zero else nullcontext():
+        _train(folder, config, overrides, is_rank_zero, is_new)
+
+
+def _train(folder: Path, config: dict[str, Any], overrides: Sequence[str], is_rank_zero: bool, is_new: bool) -> None:
     trainer = None
     try:
         with _named_memory_errors(), _libraries_in_log():
@@ -136,16 +139,6 @@ def _set_numerics(config: dict[str, Any]) -> None:
     )
 
 
-def _claim(folder: Path) -> None:
-    """Take the folder for this run; two runs that chose the same name at the same moment must not mix."""
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with (folder / _CLAIM).open("x") as stream:
-            stream.write(f"{os.getpid()}\n")
-    except FileExistsError as error:
-        raise ConfigError(f"another run has just taken {folder}.\nStart again, or name another run.folder.") from error
-
-
 def _describe(folder: Path, config: dict[str, Any], overrides: Sequence[str], is_resumed: bool) -> None:
     """Write down what the run was asked to do and where it runs; a resumed run keeps its first settings beside."""
     stamp = f".resumed-{len(list(folder.glob('config*.yaml')))}" if is_resumed else ""
@@ -153,7 +146,6 @@ def _describe(folder: Path, config: dict[str, Any], overrides: Sequence[str], is
     (folder / f"config{stamp}.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
     (folder / f"environment{stamp}.json").write_text(json.dumps(environment(), indent=1) + "\n", encoding="utf-8")
     (folder / OVERRIDES_FILE).write_text(yaml.safe_dump(kept), encoding="utf-8")
-    (folder / _CLAIM).unlink(missing_ok=True)
 
 
 def close_log(folder: Path) -> None:

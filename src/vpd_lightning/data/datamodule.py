@@ -4,8 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import lightning.pytorch as pl
+import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
@@ -74,6 +75,7 @@ class VideoDataModule(pl.LightningDataModule):
         self.validation_views = validation_views
         self.trajectories: list[TrajectoryFrames] = []
         self.validation: ValidationClips | None = None
+        self._medians: dict[int, tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]] = {}
 
     def setup(self, stage: str = "fit") -> None:
         """Open the manifest, check every trajectory that will be used. DataError says what is wrong and what to do."""
@@ -102,13 +104,24 @@ class VideoDataModule(pl.LightningDataModule):
     def _views(self, views: Sequence[int] | None) -> list[int]:
         return list(range(self.trajectories[0].num_views)) if views is None else list(views)
 
+    def _median_images(
+        self, views: Sequence[int]
+    ) -> tuple[UInt8[np.ndarray, "view height width 3"], Float32[np.ndarray, "view height width"]]:
+        """Each view's median is taken once: moving rays and the background want many of the same."""
+        missing = [view for view in dict.fromkeys(views) if view not in self._medians]
+        if missing:
+            images = zip(*median_images(self.trajectories, missing), strict=True)
+            self._medians.update(zip(missing, images, strict=True))
+        rgbs, depths = zip(*(self._medians[view] for view in views), strict=True)
+        return np.stack(rgbs), np.stack(depths)
+
     def clip_dataset(self, max_steps: int) -> ClipDataset:
         """Return the training clips of a training of ``max_steps`` updates (works without a trainer)."""
         self.setup()
         target_views = self._views(self.target_views)
         moving_rays = None
         if self.moving_ray_fraction > 0:
-            rgb, depth = median_images(self.trajectories, target_views)
+            rgb, depth = self._median_images(target_views)
             moving_rays = MovingRays(
                 self.moving_ray_fraction, self.moving_color_threshold, self.moving_depth_threshold, rgb, depth
             )
@@ -186,7 +199,7 @@ class VideoDataModule(pl.LightningDataModule):
         """
         self.setup()
         views = self.input_views if views is None else list(views)
-        rgb, depth = median_images(self.trajectories, views)
+        rgb, depth = self._median_images(views)
         first = self.trajectories[0]
         intrinsics, cam_to_world = (torch.from_numpy(part[0]).float() for part in first.cameras([0], views))
         cameras = Cameras(intrinsics, cam_to_world, first.height, first.width)

@@ -31,16 +31,6 @@ class GroundTruth:
     def num_objects(self) -> int:
         return self.positions.shape[1]
 
-    def rotations(self) -> NDArray[np.float64]:
-        """Return the body-to-world rotation matrices (time, object, 3, 3)."""
-        w, x, y, z = np.moveaxis(self.quaternions, -1, 0)
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.stack([np.stack(row, -1) for row in rows], -2)
-
 
 _LAYOUT = {
     schema.STATE_POSITIONS: (np.float64, 3),

@@ -171,10 +171,12 @@ def _check_files(folder: Path, num_bytes: Mapping[str, int]) -> None:
 
 def _missing(folder: Path) -> str:
     scene, _, preset = folder.name.rpartition("_")
-    if preset not in ("paper", "demo", "tiny") or not scene:
-        scene, preset = "mujoco_block", "demo"
+    if scene and preset in ("paper", "demo", "tiny"):
+        command, hint = f"scene={scene} preset={preset}", ""
+    else:  # the name does not say what should be in there
+        command, hint = "scene=SCENE preset=PRESET", "  (vpd-data --help lists both)"
     return (
         f"No data set in {folder} (there is no {FILE_NAME}).\n"
-        f"Make it:  vpd-data generate scene={scene} preset={preset} out={folder}\n"
+        f"Make it:  vpd-data generate {command} out={folder}{hint}\n"
         "or point data.folder at one that exists."
     )

@@ -22,7 +22,7 @@ from vpd_lightning.evaluation.clip import (
 from vpd_lightning.evaluation.long_rollout import LongRollout, judge_long_rollout
 from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
 from vpd_lightning.evaluation.protocol import Clip, Protocol, read_clip, read_clips
-from vpd_lightning.evaluation.references import mean_displacements, training_mean
+from vpd_lightning.evaluation.references import median_displacements, training_mean
 
 Progress = Callable[[str, int, int], None]
 
@@ -83,7 +83,7 @@ def evaluate(
     progress("references", 0, 1)
     train_paths = manifest.split("train")
     mean_image = training_mean(train_paths)
-    constants = mean_displacements(train_paths, protocol.start_frames, protocol.num_steps)
+    constants = median_displacements(train_paths, protocol.start_frames, protocol.num_steps)
     num_clips = len(paths) * len(protocol.start_frames)
     names, trajectory, results, kept, timings, finite = [], [], [], [], [], True
     for number, clip in enumerate(read_clips(paths, protocol)):

@@ -9,8 +9,6 @@ from vpd_lightning.metrics.moving import moving_by_difference, moving_by_segment
 from vpd_lightning.metrics.psnr import PSNR_CAP, mean_squared_error, psnr_of
 from vpd_lightning.metrics.ssim import ssim
 
-IMAGE_METRICS = ("mse", "psnr", "ssim", "moving_mse", "psnr_moving")
-
 
 def as_float(rgb: Tensor) -> Float[Tensor, "*image height width 3"]:
     """Turn uint8 colours into float32 in [0, 1]."""

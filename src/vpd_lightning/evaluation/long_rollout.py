@@ -15,7 +15,8 @@ class LongRollout:
 
     ``floor_drift_*`` is the displacement of the particles outside every true box since the last input frame, its
     largest value over the steps, then median, 99th percentile and maximum over the particles. ``centroid_error`` is
-    that of the last step the recording still shows.
+    that of the last step the recording still shows. NaN where the prediction is not finite (at any step, or at that
+    one) or hardly shows the object.
     """
 
     clip: str
@@ -61,8 +62,8 @@ def judge_long_rollout(
         size_ratio_max=size.amax(1).tolist(),
         lowest_point=motion["lowest_point"].amin(1).tolist(),
         final_speed=speeds.tolist(),
-        centroid_error=[_last_known(row) for row in motion["centroid_error"]],
-        centroid_error_copy=[_last_known(row) for row in motion["centroid_error_copy"]],
+        centroid_error=_at_last_true_step(motion["centroid_error"], motion),
+        centroid_error_copy=_at_last_true_step(motion["centroid_error_copy"], motion),
     )
 
 
@@ -70,6 +71,9 @@ def _quantile(values: Float[Tensor, " particle"], q: float) -> float:
     return float("nan") if values.numel() == 0 else float(torch.quantile(values, q))
 
 
-def _last_known(values: Float[Tensor, " step"]) -> float:
-    known = values[~values.isnan()]
-    return float(known[-1]) if known.numel() else float("nan")
+def _at_last_true_step(
+    values: Float[Tensor, "object step"], motion: dict[str, Float[Tensor, "object step"]]
+) -> list[float]:
+    """Read each object at its last step with ground truth, which the reference that needs no prediction shows."""
+    rows = zip(values, motion["centroid_error_copy"].isfinite(), strict=True)
+    return [float(row[true][-1]) if true.any() else float("nan") for row, true in rows]

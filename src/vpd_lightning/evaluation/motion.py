@@ -58,8 +58,8 @@ def body_motion(
 
     True motion carries the same particles rigidly by the change of pose. Values are metres, but for the size ratio.
     Steps beyond the recording have no error (NaN), only the values that need no truth; a prediction that is not finite
-    has no value at all. ``constant`` is the mean
-    displacement of the training set, the reference that knows no input; "copy" predicts that nothing moves.
+    has no value at all. ``constant`` is the median displacement of the training set, the reference that knows no
+    input; "copy" predicts that nothing moves.
     """
     start, pred = positions[0], positions[1:]
     finite = torch.isfinite(pred).all(-1).all(-1)

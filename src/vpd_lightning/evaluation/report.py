@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -78,49 +78,63 @@ def _motion_summary(evaluation: Evaluation, protocol: Protocol) -> dict[str, Any
     result["size_ratio"]["min"] = plain(np.nanmin(evaluation.motion["size_ratio"], initial=np.inf))
     result["size_ratio"]["max"] = plain(np.nanmax(evaluation.motion["size_ratio"], initial=-np.inf))
     for reference in ("constant", "copy"):
-        steps = zip(
-            result["centroid_error"]["per_step"], result[f"centroid_error_{reference}"]["per_step"], strict=True
+        result[f"centroid_error_over_{reference}"] = _ratio(
+            evaluation.motion["centroid_error"], evaluation.motion[f"centroid_error_{reference}"]
         )
-        ratios = [None if error is None or not other else error / other for error, other in steps]
-        result[f"centroid_error_over_{reference}"] = {"per_step": ratios}
     return result
 
 
+def _ratio(error: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[str, Any]:
+    """Ratio of the mean errors at each step (the last axis), over those objects of clips that have both."""
+    both = ~np.isnan(error) & ~np.isnan(reference)
+    axes = tuple(range(both.ndim - 1))
+    above, below = (np.where(both, values, 0.0).sum(axes) for values in (error, reference))
+    ratios = [plain(a / b) if b > 0 else None for a, b in zip(above, below, strict=True)]
+    return {"per_step": ratios, "count": int(both.sum())}
+
+
 def _long_summary(rollouts: Sequence[LongRollout]) -> dict[str, Any] | None:
+    """Summarise over clips and objects; ``count`` says how many clips have values, for every object of theirs.
+
+    A clip has none where its rollout is not finite, or where its particles hardly show the object.
+    """
     if not rollouts:
         return None
 
     def values(name: str) -> NDArray[np.float64]:
         return np.hstack([np.atleast_1d(getattr(rollout, name)) for rollout in rollouts]).astype(np.float64)
 
-    def median(name: str) -> float | None:
-        known = values(name)[~np.isnan(values(name))]
-        return plain(np.median(known)) if known.size else None
+    def block(decides: str, **figures: tuple[str, Callable[[NDArray[np.float64]], Any]]) -> dict[str, Any]:
+        """All figures of a block speak about the same clips and objects: those whose ``decides`` is a number."""
+        known = np.isfinite(values(decides))
+        count = sum(bool(np.isfinite(getattr(rollout, decides)).all()) for rollout in rollouts)
+        picked = {name: plain(pick(values(of)[known])) if known.any() else None for name, (of, pick) in figures.items()}
+        return {**picked, "count": count}
 
     return {
         "num_steps": rollouts[0].num_steps,
         "num_clips": len(rollouts),
         "finite": all(rollout.finite for rollout in rollouts),
-        "floor_drift": {
-            "median": median("floor_drift_median"),
-            "p99": median("floor_drift_p99"),
-            "max": _extreme(values("floor_drift_max"), max),
-        },
-        "size_ratio": {
-            "median": median("size_ratio_end"),
-            "min": _extreme(values("size_ratio_min"), min),
-            "max": _extreme(values("size_ratio_max"), max),
-        },
-        "lowest_point": {"median": median("lowest_point"), "min": _extreme(values("lowest_point"), min)},
-        "final_speed": {"median": median("final_speed"), "max": _extreme(values("final_speed"), max)},
-        "centroid_error": {"median": median("centroid_error"), "copy_median": median("centroid_error_copy")},
+        "num_finite": sum(rollout.finite for rollout in rollouts),
+        "floor_drift": block(
+            "floor_drift_max",
+            median=("floor_drift_median", np.median),
+            p99=("floor_drift_p99", np.median),
+            max=("floor_drift_max", np.max),
+        ),
+        "size_ratio": block(
+            "size_ratio_min",
+            median=("size_ratio_end", np.median),
+            min=("size_ratio_min", np.min),
+            max=("size_ratio_max", np.max),
+        ),
+        "lowest_point": block("lowest_point", median=("lowest_point", np.median), min=("lowest_point", np.min)),
+        "final_speed": block("final_speed", median=("final_speed", np.median), max=("final_speed", np.max)),
+        "centroid_error": block(
+            "centroid_error", median=("centroid_error", np.median), copy_median=("centroid_error_copy", np.median)
+        ),
         "clips": [_json_ready(asdict(rollout)) for rollout in rollouts],
     }
-
-
-def _extreme(values: NDArray[np.float64], pick: Any) -> float | None:
-    known = values[~np.isnan(values)]
-    return plain(pick(known)) if known.size else None
 
 
 def _json_ready(value: Any) -> Any:

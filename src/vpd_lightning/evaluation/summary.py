@@ -68,17 +68,27 @@ def _motion_lines(motion: Mapping[str, Any], num_steps: int) -> list[str]:
 
 
 def _long_lines(rollout: Mapping[str, Any]) -> list[str]:
-    drift, size = rollout["floor_drift"], rollout["size_ratio"]
+    drift, size, lowest, speed = (
+        rollout[name] for name in ("floor_drift", "size_ratio", "lowest_point", "final_speed")
+    )
+    num_clips = rollout["num_clips"]
+    finite = "everything finite" if rollout["finite"] else f"NOT FINITE in {num_clips - rollout['num_finite']} of them"
     return [
-        f"{rollout['num_steps']}-step rollout of {rollout['num_clips']} clips: "
-        + ("everything finite" if rollout["finite"] else "NOT FINITE"),
-        f"  floor drift   median {_number(_scaled(drift['median'], 100), 2)} cm, p99 "
-        f"{_number(_scaled(drift['p99'], 100), 2)} cm, worst particle {_number(_scaled(drift['max'], 100), 2)} cm",
-        f"  block size    {_number(size['min'], 2)} to {_number(size['max'], 2)} of its start "
-        f"(median at the end {_number(size['median'], 2)})",
-        f"  lowest point  {_number(rollout['lowest_point']['min'], 3)} m; speed over the last 10 steps "
-        f"{_number(_scaled(rollout['final_speed']['median'], 100), 2)} cm/step (median)",
+        f"{rollout['num_steps']}-step rollout of {num_clips} clips: {finite}",
+        f"  floor drift   worst particle {_number(_scaled(drift['max'], 100), 2)} cm; median clip: p99 "
+        f"{_number(_scaled(drift['p99'], 100), 2)} cm, median {_number(_scaled(drift['median'], 100), 2)} cm"
+        + _share(drift, num_clips),
+        f"  block size    {_number(size['min'], 2)} to {_number(size['max'], 2)} of its start; median clip "
+        f"{_number(size['median'], 2)} at the end" + _share(size, num_clips),
+        f"  lowest point  {_number(lowest['min'], 3)} m" + _share(lowest, num_clips),
+        f"  last speed    {_number(_scaled(speed['median'], 100), 2)} cm/step over the last 10 steps, median clip"
+        + _share(speed, num_clips),
     ]
+
+
+def _share(block: Mapping[str, Any], num_clips: int) -> str:
+    """Say over how many clips a block speaks, where that is not all."""
+    return "" if block["count"] == num_clips else f" ({block['count']} of {num_clips} clips)"
 
 
 def _scaled(value: float | None, scale: float) -> float | None:

@@ -1,5 +1,6 @@
 """Features of a location: sums of the latent features of nearby particles under concentric annular kernels."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -37,14 +38,16 @@ def annular_features(
         if num_particles == 0:
             return queries.new_zeros(*queries.shape[:-1], len(kernel_radii) * feature_dim)
         table = torch.cat([positions, features], dim=-1).reshape(-1, 3 + feature_dim)
-        index = neighbors.index.reshape(-1, num_queries, k)
+        num_sets, width = math.prod(queries.shape[:-2]), len(kernel_radii) * feature_dim
+        index = neighbors.index.reshape(num_sets, num_queries, k)
         if len(index) > 1:
             index = index + num_particles * torch.arange(len(index), device=index.device)[:, None, None]
-        gathered = table.index_select(0, index.reshape(-1)).view(-1, k, 3 + feature_dim)
+        gathered = table.index_select(0, index.reshape(-1)).view(num_sets * num_queries, k, 3 + feature_dim)
         distance = safe_norm(gathered[..., :3] - queries.reshape(-1, 1, 3))
-        weights = kernel_weights(distance, neighbors.mask.reshape(-1, k), kernel_radii, kernel_bandwidths)
+        mask = neighbors.mask.reshape(num_sets * num_queries, k)
+        weights = kernel_weights(distance, mask, kernel_radii, kernel_bandwidths)
         summed = torch.bmm(weights.transpose(1, 2), gathered[..., 3:])
-        return summed.reshape(*queries.shape[:-1], -1)
+        return summed.reshape(*queries.shape[:-1], width)
 
 
 def kernel_weights(

@@ -45,7 +45,7 @@ def ray_candidates(particles: Particles, rays: Rays, num_candidates: int, near: 
         table = torch.cat([positions, at_least_float32(particles.features).to(positions.dtype)], dim=-1).flatten(0, 1)
         if num_particles == 0:
             table = table.new_zeros(1, table.shape[1])
-        gathered = table.index_select(0, flat.reshape(-1)).view(batch_size, num_rays, num_candidates, -1)
+        gathered = table.index_select(0, flat.reshape(-1)).view(batch_size, num_rays, num_candidates, table.shape[1])
         offset = gathered[..., :3] - origins[:, :, None]
         along = (offset * directions[:, :, None]).sum(dim=-1)
         across = safe_norm(offset - along[..., None] * directions[:, :, None])
@@ -124,7 +124,7 @@ def ray_features(
         weights = kernel_weights(distance, mask, kernel_radii, kernel_bandwidths)
         rows = weights.transpose(-1, -2).flatten(2, 3).flatten(0, 1)
         summed = torch.bmm(rows, candidates.features.flatten(0, 1))
-        return summed.view(*t.shape, -1)
+        return summed.view(*t.shape, len(kernel_radii) * candidates.features.shape[-1])
 
 
 @torch.no_grad()

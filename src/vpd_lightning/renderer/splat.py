@@ -151,7 +151,7 @@ class SplatRenderer(AbstractRenderer):
                         eyes[m, s : s + _SEARCH_BLOCK],
                         directions[m, s : s + _SEARCH_BLOCK],
                     )
-                    for s in range(0, eyes.shape[1], _SEARCH_BLOCK)
+                    for s in range(0, max(eyes.shape[1], 1), _SEARCH_BLOCK)
                 ]
             )
             for m in range(len(positions))

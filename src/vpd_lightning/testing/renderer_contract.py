@@ -145,6 +145,11 @@ class RendererContract(Contract):
             gradients = {key: parameter.grad for key, parameter in renderer.named_parameters()}
             assert_finite([gradients, features.grad], f"{name}: gradient ")
 
+    def test_no_rays_give_an_empty_picture(self) -> None:
+        rays = self.rays()
+        none = Rays(rays.origins[:, :0], rays.directions[:, :0])
+        _assert_image(self.built()(self.particles(), none, None), (2, 0))
+
     def test_all_that_was_learned_is_in_the_state_dict(self) -> None:
         trained, fresh = self.built(), self.build().to(self.device, torch.float64).eval()
         fresh.load_state_dict(trained.state_dict())
