@@ -63,18 +63,15 @@ class Cameras(_Border):
 class RGBDFrames(_Border):
     """RGB-D images of one or more time steps; ``rgb`` is uint8, or float in [0, 1].
 
-    ``depth`` is z-depth in metres, 0 or non-finite where there is no measurement. ``moving`` marks pixels that may
-    belong to something that moves, where a background model is at hand.
+    ``depth`` is z-depth in metres, 0 or non-finite where there is no measurement.
     """
 
     rgb: Float[Tensor, "*shape height width 3"] | UInt8[Tensor, "*shape height width 3"]
     depth: Float[Tensor, "*shape height width"]
     cameras: Cameras
-    moving: Bool[Tensor, "*shape height width"] | None = None
 
     def __getitem__(self, index: Any) -> "RGBDFrames":
-        moving = None if self.moving is None else self.moving[index]
-        return RGBDFrames(self.rgb[index], self.depth[index], self.cameras[index], moving)
+        return RGBDFrames(self.rgb[index], self.depth[index], self.cameras[index])
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from tests.dynamics.test_rigid_motion import cube, random_toss
+from tests.dynamics.test_rigid_motion import cube, random_toss, rotation_about
 from vpd_lightning.dynamics.inertial import InertialDynamics
 from vpd_lightning.dynamics.rigid_motion import rotation_from_spin
 from vpd_lightning.randomness import RandomKeys
@@ -20,6 +21,8 @@ SETTINGS = {
     "num_forces": 2,
     "location_scale": 0.3,
     "contact_range": 0.5,
+    "num_contact_iterations": 4,
+    "max_contact_depth": 0.06,
     "match_scales": [0.12, 0.07, 0.04, 0.025, 0.015],
     "match_color_scale": 0.05,
     "match_radius": 0.3,
@@ -94,6 +97,7 @@ def test_a_free_spinning_cube_is_followed_around_its_true_centre():
     spin = torch.tensor([0.2, -0.1, 0.25], dtype=torch.float64)
     turn, shift = rotation_from_spin(spin), torch.tensor([0.03, 0.0, -0.02], dtype=torch.float64)
     model = dynamics(num_matched=200)
+    torch.nn.init.constant_(model.forces.damping.bias, 30.0)  # no damping at all
     previous = scene(points, colors, normals)
     current = scene(points @ turn.T + shift, colors, normals @ turn.T)
     keys = RandomKeys.fixed(1)
@@ -133,6 +137,47 @@ def test_a_body_at_rest_without_forces_stays_at_rest():
     assert (states[-1].positions - still.positions).norm(dim=-1).max() < 0.01
     # shading follows the turn of a surface: hardly any turn, hardly any change
     assert (states[-1].features - still.features).abs().max() < 0.05
+
+
+def falling(height, speed, angle, steps, **changes):
+    """Roll a cube that moves down ``speed`` metres a step, turned by ``angle`` about y, from ``height``."""
+    points, colors, normals = cube(300, seed=5)
+    turn = rotation_about([0, 1, 0], angle)
+    now = scene(points @ turn.T, colors, normals @ turn.T, height=height, num_floor=400)
+    before = scene(points @ turn.T, colors, normals @ turn.T, height=height + speed, num_floor=400)
+    model = dynamics(num_anchors=1, num_probes=300, num_matched=300, **changes)
+    with torch.no_grad():  # gravity of 2.5 cm a step, as 9.81 m/s^2 at 20 frames/s
+        model.forces.weight.bias[2] = -math.atanh(0.0245 / SETTINGS["location_scale"])
+    return roll(model, before, now, steps), now
+
+
+def test_a_falling_body_stops_on_the_floor_and_stays_there():
+    states, now = falling(height=0.35, speed=0.06, angle=0.0, steps=40)
+    body = now.moving[0]
+
+    lowest = torch.stack([state.positions[0, body, 2].min() for state in states])
+    assert lowest.min() > -0.01
+    heights = states[-1].positions[0, body, 2]
+    assert 0.27 < heights.max() < 0.33  # a cube of 30 cm on one of its faces
+    assert (states[-1].positions - states[-5].positions).norm(dim=-1).max() < 0.02
+
+
+def test_a_tilted_body_is_turned_by_what_it_hits():
+    states, now = falling(height=0.30, speed=0.05, angle=0.3, steps=6)
+    body = now.moving[0]
+
+    def heights(state):
+        return state.positions[0, body, 2]
+
+    assert torch.stack([heights(state).min() for state in states]).min() > -0.01
+    turned = states[-1].positions[0, body] - now.positions[0, body]
+    assert (turned[:, 2].max() - turned[:, 2].min()) > 0.02  # not a mere shift
+
+
+def test_without_contact_iterations_a_body_falls_through_the_floor():
+    states, now = falling(height=0.35, speed=0.06, angle=0.0, steps=12, num_contact_iterations=0)
+
+    assert states[-1].positions[0, now.moving[0], 2].min() < -0.2
 
 
 def test_moving_the_world_moves_the_prediction():

@@ -154,6 +154,12 @@ def test_background_marks_what_stands_in_front_and_particles_favour_it():
     particles = model(closer, RandomKeys.fixed(1), "current").particles
 
     assert int(moving.sum()) == 4 and moving[0, 1, 2:4, 2:4].all()
+    still = ~particles.moving[0]
+    pixels, _ = project(particles.positions[0, still], closer.cameras[0, 1])
+    # within view 1 nothing static lies beside what moves: pixels 1 to 4 in both directions
+    near = ((pixels - 3.0).abs() < 1.99).all(-1)
+    from_view_1 = (pixels.frac() - 0.5).abs().amax(-1) < 1e-3
+    assert not (near & from_view_1 & particles.mask[0, still]).any()
     assert int(particles.moving.sum()) == 4
     assert (particles.positions[particles.moving][:, 2] > 0.4).all()
     assert "background.depth" in model.state_dict()

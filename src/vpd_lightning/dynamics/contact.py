@@ -1,10 +1,12 @@
-"""Where moving particles are in relation to what stands still: signed distance to the nearest static surface."""
+"""Where moving particles are in relation to what stands still, and keeping them out of it."""
 
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from vpd_lightning.dynamics.rigid_motion import Twists, cross, rotate, rotation_from_spin
 
 
 @dataclass(frozen=True)
@@ -42,3 +44,40 @@ def nearest_static_contacts(
         normals=normals * known[..., None],
         lateral=torch.where(known, lateral, torch.full_like(lateral, far)),
     )
+
+
+def resolve_contacts(
+    twists: Twists,
+    positions: Float[Tensor, "batch probe 3"],
+    contacts: Contacts,
+    belongs: Bool[Tensor, "batch anchor probe"],
+    inverse_inertia: Float[Tensor, "batch anchor 3 3"],
+    *,
+    num_iterations: int,
+    max_depth: float,
+) -> Twists:
+    """Correct the twists of one step so that no probe ends up inside what stands still.
+
+    Position-based dynamics (Mueller et al. 2007, 2020): each round takes the deepest probe of each anchor and applies
+    the smallest impulse at that point that lifts it out, to displacement and spin alike. What is carried on to the next
+    step has lost the motion into the surface: an inelastic impact without friction; a body that tips over an edge gets
+    its torque. Bounce and friction are left to what is learned. Probes that were deeper than ``max_depth`` (metres)
+    before the step are left alone: their surface is not to be trusted.
+    """
+    offsets = positions[:, None] - twists.centers[:, :, None]
+    normals = contacts.normals[:, None].expand_as(offsets)
+    known = (contacts.normals.square().sum(dim=-1) > 0.5) & (contacts.distances > -max_depth)
+    touchable = belongs & known[:, None]
+    displacements, spins = twists.displacements, twists.spins
+    for _ in range(num_iterations):
+        turned = rotate(rotation_from_spin(spins)[:, :, None], offsets)
+        ahead = contacts.distances[:, None] + ((displacements[:, :, None] + turned - offsets) * normals).sum(dim=-1)
+        deepest, probe = ahead.masked_fill(~touchable, torch.inf).min(dim=-1, keepdim=True)
+        depth = torch.relu(-deepest)
+        at = probe[..., None].expand(-1, -1, -1, 3)
+        normal = torch.gather(normals, 2, at).squeeze(2)
+        arm = cross(torch.gather(turned, 2, at).squeeze(2), normal)
+        turn = rotate(inverse_inertia, arm)
+        impulse = depth / (1 + (arm * turn).sum(dim=-1, keepdim=True))
+        displacements, spins = displacements + impulse * normal, spins + impulse * turn
+    return Twists(twists.centers, displacements, spins)

@@ -6,11 +6,11 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.body_forces import BodyForces
-from vpd_lightning.dynamics.contact import nearest_static_contacts
+from vpd_lightning.dynamics.contact import nearest_static_contacts, resolve_contacts
 from vpd_lightning.dynamics.rigid_motion import (
     Twists,
     anchor_weights,
@@ -75,6 +75,8 @@ class InertialDynamics(AbstractDynamics):
         num_forces: int,
         location_scale: float,
         contact_range: float,
+        num_contact_iterations: int,
+        max_contact_depth: float,
         match_scales: Sequence[float],
         match_color_scale: float,
         match_radius: float,
@@ -92,6 +94,8 @@ class InertialDynamics(AbstractDynamics):
         self.anchor_radius, self.body_radius, self.match_radius = anchor_radius, body_radius, match_radius
         self.match_scales, self.match_color_scale = list(match_scales), match_color_scale
         self.contact_range = contact_range
+        self.num_contact_iterations, self.max_contact_depth = num_contact_iterations, max_contact_depth
+        self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
         self.forces = BodyForces(
             hidden_dim=hidden_dim,
             message_passing_steps=message_passing_steps,
@@ -194,14 +198,26 @@ class InertialDynamics(AbstractDynamics):
             memory.static_mask,
             self.contact_range,
         )
+        # Mass inside a body is not where its surface particles are: one learned factor on their inverse inertia.
+        inverse_inertia = invert_inertia(positions, memory.centers, memory.body_weights) * self.log_inertia_ratio.exp()
+        weights = memory.fit_weights[:, :, probes]
         twists = self.forces(
             positions[:, probes],
             memory.displacements[:, probes],
             contacts,
             memory.mask[:, probes],
-            memory.fit_weights[:, :, probes],
+            weights,
             twists,
-            invert_inertia(positions, memory.centers, memory.body_weights),
+            inverse_inertia,
+        )
+        twists = resolve_contacts(
+            twists,
+            positions[:, probes],
+            contacts,
+            memory.mask[:, None, probes] & (weights > 1e-3 * weights.amax(dim=-1, keepdim=True)),
+            inverse_inertia,
+            num_iterations=self.num_contact_iterations,
+            max_depth=self.max_contact_depth,
         )
         following = _apply_twists(positions, twists, memory.blend_weights)
         following = torch.where(memory.mask[..., None], following, positions)

@@ -13,7 +13,7 @@ class MovingShading(nn.Module):
     def __init__(self, *, feature_dim: int, hidden_dim: int):
         super().__init__()
         self.network = nn.Sequential(
-            nn.Linear(feature_dim + 3, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, feature_dim, bias=False)
+            nn.Linear(feature_dim + 3, hidden_dim), nn.SiLU(), nn.Linear(hidden_dim, feature_dim, bias=False)
         )
 
     def forward(
@@ -43,7 +43,7 @@ class StaticShading(nn.Module):
         self.scales = list(scales)
         self.network = nn.Sequential(
             nn.Linear(feature_dim + 4 * len(self.scales), hidden_dim),
-            nn.ReLU(),
+            nn.SiLU(),
             nn.Linear(hidden_dim, feature_dim, bias=False),
         )
 
