@@ -51,14 +51,17 @@ def dropping(distances, speed=0.1):
     return twists, positions, contacts
 
 
-def resolve(distances, num_iterations=1, inverse_inertia=100.0):
+def resolve(distances, num_iterations=1, inverse_inertia=100.0, friction=0.0, sideways=0.0):
     twists, positions, contacts = dropping(distances)
+    aside = torch.tensor([0.0, sideways, 0.0], dtype=torch.float64)
+    twists = Twists(twists.centers, twists.displacements + aside, twists.spins)
     return twists, resolve_contacts(
         twists,
         positions,
         contacts,
         torch.ones(1, 1, 3, dtype=torch.bool),
         inverse_inertia * torch.eye(3, dtype=torch.float64)[None, None],
+        torch.tensor(friction, dtype=torch.float64),
         num_iterations=num_iterations,
         max_depth=0.06,
     )
@@ -92,3 +95,17 @@ def test_a_point_deep_inside_is_left_alone():
     before, after = resolve([-0.2, 0.5, 0.5])
 
     assert torch.equal(after.displacements, before.displacements)
+
+
+def test_friction_takes_at_most_its_share_of_the_impulse_from_sliding():
+    # No inertia to turn: depth 0.08 is the impulse, friction 0.5 allows 0.04 of it against 0.06 of sliding.
+    before, after = resolve([0.02, 0.5, 0.5], inverse_inertia=0.0, friction=0.5, sideways=0.06)
+
+    change = (after.displacements - before.displacements)[0, 0]
+    assert torch.allclose(change, torch.tensor([0.0, -0.04, 0.08], dtype=torch.float64))
+
+
+def test_enough_friction_stops_the_sliding_and_never_reverses_it():
+    _, after = resolve([0.02, 0.5, 0.5], inverse_inertia=0.0, friction=5.0, sideways=0.06)
+
+    assert torch.allclose(after.displacements[0, 0], torch.tensor([0.0, 0.0, -0.02], dtype=torch.float64), atol=1e-9)

@@ -21,6 +21,7 @@ SETTINGS = {
     "num_forces": 2,
     "location_scale": 0.3,
     "contact_range": 0.5,
+    "contact_reach": 5.0,
     "num_contact_iterations": 4,
     "max_contact_depth": 0.06,
     "match_scales": [0.12, 0.07, 0.04, 0.025, 0.015],

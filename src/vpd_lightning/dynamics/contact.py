@@ -52,6 +52,7 @@ def resolve_contacts(
     contacts: Contacts,
     belongs: Bool[Tensor, "batch anchor probe"],
     inverse_inertia: Float[Tensor, "batch anchor 3 3"],
+    friction: Float[Tensor, ""],
     *,
     num_iterations: int,
     max_depth: float,
@@ -59,10 +60,11 @@ def resolve_contacts(
     """Correct the twists of one step so that no probe ends up inside what stands still.
 
     Position-based dynamics (Mueller et al. 2007, 2020): each round takes the deepest probe of each anchor and applies
-    the smallest impulse at that point that lifts it out, to displacement and spin alike. What is carried on to the next
-    step has lost the motion into the surface: an inelastic impact without friction; a body that tips over an edge gets
-    its torque. Bounce and friction are left to what is learned. Probes that were deeper than ``max_depth`` (metres)
-    before the step are left alone: their surface is not to be trusted.
+    the smallest impulse at that point that lifts it out, to displacement and spin alike, and an impulse against its
+    sliding of at most ``friction`` times that (Coulomb). What is carried on to the next step has lost the motion into
+    the surface: an inelastic impact; a body that tips over an edge gets its torque. Bounce is left to what is learned.
+    Probes that were deeper than ``max_depth`` (metres) before the step are left alone: their surface is not to be
+    trusted.
     """
     offsets = positions[:, None] - twists.centers[:, :, None]
     normals = contacts.normals[:, None].expand_as(offsets)
@@ -71,13 +73,27 @@ def resolve_contacts(
     displacements, spins = twists.displacements, twists.spins
     for _ in range(num_iterations):
         turned = rotate(rotation_from_spin(spins)[:, :, None], offsets)
-        ahead = contacts.distances[:, None] + ((displacements[:, :, None] + turned - offsets) * normals).sum(dim=-1)
+        moves = displacements[:, :, None] + turned - offsets
+        ahead = contacts.distances[:, None] + (moves * normals).sum(dim=-1)
         deepest, probe = ahead.masked_fill(~touchable, torch.inf).min(dim=-1, keepdim=True)
-        depth = torch.relu(-deepest)
         at = probe[..., None].expand(-1, -1, -1, 3)
         normal = torch.gather(normals, 2, at).squeeze(2)
-        arm = cross(torch.gather(turned, 2, at).squeeze(2), normal)
-        turn = rotate(inverse_inertia, arm)
-        impulse = depth / (1 + (arm * turn).sum(dim=-1, keepdim=True))
-        displacements, spins = displacements + impulse * normal, spins + impulse * turn
+        arm = torch.gather(turned, 2, at).squeeze(2)
+        lift = torch.relu(-deepest) * _response(arm, normal, inverse_inertia)
+        push = lift * normal
+        displacements, spins = displacements + push, spins + rotate(inverse_inertia, cross(arm, push))
+
+        move = torch.gather(moves, 2, at).squeeze(2) + push + cross(rotate(inverse_inertia, cross(arm, push)), arm)
+        sliding = move - (move * normal).sum(dim=-1, keepdim=True) * normal
+        speed = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+        direction = sliding / speed
+        stop = speed * _response(arm, direction, inverse_inertia)
+        push = -torch.minimum(stop, friction * lift) * direction
+        displacements, spins = displacements + push, spins + rotate(inverse_inertia, cross(arm, push))
     return Twists(twists.centers, displacements, spins)
+
+
+def _response(arm: Tensor, direction: Tensor, inverse_inertia: Tensor) -> Tensor:
+    """Return the impulse along ``direction`` that moves the point at ``arm`` by one unit along it, for unit mass."""
+    lever = cross(arm, direction)
+    return 1 / (1 + (lever * rotate(inverse_inertia, lever)).sum(dim=-1, keepdim=True))

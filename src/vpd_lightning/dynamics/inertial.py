@@ -75,6 +75,7 @@ class InertialDynamics(AbstractDynamics):
         num_forces: int,
         location_scale: float,
         contact_range: float,
+        contact_reach: float,
         num_contact_iterations: int,
         max_contact_depth: float,
         match_scales: Sequence[float],
@@ -93,9 +94,10 @@ class InertialDynamics(AbstractDynamics):
         self.num_anchors, self.num_probes, self.num_matched = num_anchors, num_probes, num_matched
         self.anchor_radius, self.body_radius, self.match_radius = anchor_radius, body_radius, match_radius
         self.match_scales, self.match_color_scale = list(match_scales), match_color_scale
-        self.contact_range = contact_range
+        self.contact_range, self.contact_reach = contact_range, contact_reach
         self.num_contact_iterations, self.max_contact_depth = num_contact_iterations, max_contact_depth
         self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
+        self.log_friction = nn.Parameter(torch.tensor(0.5).log())
         self.forces = BodyForces(
             hidden_dim=hidden_dim,
             message_passing_steps=message_passing_steps,
@@ -196,7 +198,7 @@ class InertialDynamics(AbstractDynamics):
             static_positions,
             _take(current.normals, memory.static_index),  # type: ignore[arg-type]
             memory.static_mask,
-            self.contact_range,
+            self.contact_reach,
         )
         # Mass inside a body is not where its surface particles are: one learned factor on their inverse inertia.
         inverse_inertia = invert_inertia(positions, memory.centers, memory.body_weights) * self.log_inertia_ratio.exp()
@@ -216,6 +218,7 @@ class InertialDynamics(AbstractDynamics):
             contacts,
             memory.mask[:, None, probes] & (weights > 1e-3 * weights.amax(dim=-1, keepdim=True)),
             inverse_inertia,
+            self.log_friction.exp(),
             num_iterations=self.num_contact_iterations,
             max_depth=self.max_contact_depth,
         )
