@@ -25,20 +25,21 @@ def nearest_static_contacts(
     static_mask: Bool[Tensor, "batch particle"],
     far: float,
 ) -> Contacts:
-    """Measure each probe against the tangent plane of its nearest static particle.
+    """Measure each probe against the tangent plane of its nearest static particle whose normal is known.
 
     The point-to-plane distance is exact on flat surfaces however sparse the particles are. Without any static
     particle, or beyond ``far`` metres, the distance is ``far`` and the normal zero: no contact.
     """
     with torch.no_grad():
+        oriented = static_mask & (static_normals.square().sum(dim=-1) > 0.5)
         square = (probes[:, :, None] - static_positions[:, None]).square().sum(dim=-1)
-        nearest_square, index = square.masked_fill(~static_mask[:, None], float("inf")).min(dim=-1)
+        nearest_square, index = square.masked_fill(~oriented[:, None], float("inf")).min(dim=-1)
     batch = torch.arange(len(probes), device=probes.device)[:, None]
     normals = static_normals[batch, index]
     offsets = probes - static_positions[batch, index]
     distances = (offsets * normals).sum(dim=-1)
     lateral = (offsets - distances[..., None] * normals).square().sum(dim=-1).clamp(min=1e-12).sqrt()
-    known = (normals.square().sum(dim=-1) > 0.5) & torch.isfinite(nearest_square) & (nearest_square < far**2)
+    known = torch.isfinite(nearest_square) & (nearest_square < far**2)
     return Contacts(
         distances=torch.where(known, distances, torch.full_like(distances, far)),
         normals=normals * known[..., None],
