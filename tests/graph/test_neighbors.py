@@ -154,6 +154,13 @@ def test_auto_is_a_fixed_rule() -> None:
     assert automatic_backend(torch.device("cuda"), 16384) == "torch"
 
 
+@pytest.mark.cluster
+def test_the_graph_takes_torch_cluster_where_it_is_installed_and_the_renderer_does_not():
+    for device in (torch.device("cpu"), torch.device("cuda")):
+        assert automatic_backend(device, 1024, is_graph=True) == "torch_cluster"
+        assert automatic_backend(device, 16384) != "torch_cluster"
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("backend", ALL_BACKENDS)
 def test_cuda_tensors_give_the_same_distances(backend: str) -> None:

@@ -32,12 +32,12 @@ class _Search(Protocol):
 def automatic_backend(device: torch.device, num_points: int, *, is_radius: bool = False, is_graph: bool = False) -> str:
     """Return the backend that ``auto`` means: a fixed rule, never a timing, so that a run repeats bit for bit.
 
-    ``is_graph`` marks the searches of the dynamics' graph, which take torch-cluster on a GPU where it is installed.
+    ``is_graph`` marks the searches of the dynamics' graph, which take torch-cluster where it is installed.
     """
+    if is_graph and importlib.util.find_spec("torch_cluster") is not None:
+        return "torch_cluster"
     if device.type == "cpu":
         return "scipy" if num_points >= (_TREE_FROM_RADIUS_POINTS if is_radius else _TREE_FROM_POINTS) else "torch"
-    if is_graph and device.type == "cuda" and importlib.util.find_spec("torch_cluster") is not None:
-        return "torch_cluster"
     return "torch"
 
 
