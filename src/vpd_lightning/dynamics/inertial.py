@@ -34,9 +34,7 @@ class InertialMemory:
     index: Int[Tensor, "batch moving"]  # slots of the moving candidates among all particles
     mask: Bool[Tensor, "batch moving"]
     displacements: Float[Tensor, "batch moving 3"]  # of the last step, exact from the second prediction on
-    fit_weights: Float[
-        Tensor, "batch anchor moving"
-    ]  # rows sum to one: which particles an anchor's motion is fitted to
+    fit_weights: Float[Tensor, "batch anchor moving"]  # rows sum to one: which particles an anchor is fitted to
     centers: Float[Tensor, "batch anchor 3"]  # of the body an anchor belongs to; carried along as if it were a particle
     center_displacements: Float[Tensor, "batch anchor 3"]
     body_weights: Float[Tensor, "batch anchor moving"]  # rows sum to one, wider than fit_weights: whose mass it is
@@ -54,9 +52,10 @@ class InertialDynamics(AbstractDynamics):
     """Newton's first law built in, the second learned.
 
     The first velocity comes from locally rigid soft matching of the two frames; afterwards correspondences are exact.
-    Each step fits the last displacement by one twist per anchor, lets ``BodyForces`` correct the twists, and moves the
-    particles by the blended twists. Particles that are not candidates for motion keep their place exactly. Features
-    change only by shading: a turned surface, a moved shadow. At initialisation this is constant screw motion.
+    Each step fits the last displacement by one twist per anchor, lets ``BodyForces`` correct the twists, keeps them out
+    of what stands still (``resolve_contacts``), and moves the particles by the blended twists. Particles that are not
+    candidates for motion keep their place exactly. Features change only by shading: a turned surface, a moved shadow.
+    At initialisation this is a screw motion that contact alone changes, but for 0.7 % of damping a step.
     """
 
     # Paper: the dynamics is a hierarchical GNN without velocities or correspondences; this one is ours
