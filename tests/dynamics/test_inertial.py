@@ -200,28 +200,32 @@ def test_moving_the_world_moves_the_prediction():
 
 
 def test_a_batch_equals_its_members_whatever_their_padding():
-    pairs = [tossed(0), tossed(1)]
     model = dynamics()
     torch.nn.init.normal_(model.forces.force.weight, std=0.1)
+    full, shorter = (tossed(seed)[1] for seed in (0, 1))
+    kept = torch.ones_like(shorter.mask)
+    kept[0, 150:200] = False  # fewer candidates than its neighbour in the batch: its gathered set is padded
+    shorter = replace(shorter, mask=kept, moving=shorter.moving & kept)
+    names = ("positions", "features", "mask", "colors", "moving", "normals")
+    both = Particles(**{name: torch.cat([getattr(full, name), getattr(shorter, name)]) for name in names})
 
-    def stack(index):
-        members = [pair[index] for pair in pairs]
-        fewer = members[1].moving.clone()
-        fewer[0, 150:200] = False  # member 1 has fewer candidates, so its gathered set is padded
-        keep = members[1].mask.clone()
-        keep[0, 150:200] = False
-        members[1] = replace(members[1], moving=fewer, mask=keep)
-        names = ("positions", "features", "mask", "colors", "moving", "normals")
-        return members, Particles(**{n: torch.cat([getattr(m, n) for m in members]) for n in names})
+    def rolled(particles):
+        return roll(model, replace(particles, positions=particles.positions - 0.02), particles, 2)[-1].positions
 
-    _, current = stack(1)
-    (_, lone_current), previous = stack(1)[0], None
-    previous = replace(current, positions=current.positions - 0.02)
-    together = roll(model, previous, current, 2)
-    alone = roll(model, replace(lone_current, positions=lone_current.positions - 0.02), lone_current, 2)
+    assert torch.allclose(rolled(both)[1, kept[0]], rolled(shorter)[0, kept[0]], atol=1e-8)
 
-    kept = lone_current.mask[0]
-    assert torch.allclose(together[-1].positions[1, kept], alone[-1].positions[0, kept], atol=1e-8)
+
+def test_friction_and_inertia_are_learned_from_a_body_that_strikes_and_slides():
+    points, colors, normals = cube(300, seed=5)
+    turn = rotation_about([0, 1, 0], 0.3)
+    aside = torch.tensor([0.05, 0.0, 0.0], dtype=torch.float64)
+    model = dynamics(num_anchors=1, num_probes=300, num_matched=300)
+    now = scene(points @ turn.T, colors, normals @ turn.T, height=0.25, num_floor=400)
+    before = scene(points @ turn.T - aside, colors, normals @ turn.T, height=0.30, num_floor=400)
+
+    roll(model, before, now, 3)[-1].positions.square().sum().backward()
+
+    assert model.log_friction.grad.abs() > 0 and model.log_inertia_ratio.grad.abs() > 0
 
 
 def test_every_parameter_receives_a_finite_gradient():

@@ -82,7 +82,7 @@ def test_all_weights_learn_and_an_interrupted_training_equals_an_uninterrupted_o
     check = CheckGradients()
     tiny_trainer(tmp_path / "a", 4, [check], val_check_interval=2).fit(module, datamodule)
     missed = {name for name, parameter in module.named_parameters() if parameter.requires_grad} - check.reached
-    # Nothing slides over anything in these recordings; tests/test_contracts.py and tests/dynamics reach friction.
+    # Nothing slides over anything in these recordings; tests/dynamics/test_inertial.py reaches friction.
     assert missed <= {"simulator.dynamics.log_friction"}
 
     module, datamodule = build_training(data, model)
