@@ -34,12 +34,13 @@ def environment(backend: str) -> dict[str, str]:
 def start(scene: str, settings: Any, backend: str, stop_event: StopEvent | None) -> None:
     """Build the scene of this process.
 
-    With a ``stop_event`` this is a worker: Ctrl-C is left to the parent, which sets the event, and SIGTERM unwinds, so
-    that a half-written file is removed. Both signals arrive blocked (see ``data_gen.pool``).
+    With a ``stop_event`` this is a worker: Ctrl-C is left to the parent, which sets the event, and SIGTERM is noted and
+    unwinds at the next frame, so that a half-written file is removed. Both signals arrive blocked (see
+    ``data_gen.pool``).
     """
     if stop_event is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, _leave)
+        signal.signal(signal.SIGTERM, _note)
         if hasattr(signal, "pthread_sigmask"):
             signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
     _state["scene"] = import_module(f"data_gen.{scene}").Scene(settings, backend)
@@ -66,14 +67,17 @@ def make_file(seed: int, split: str, index: int, path: Path, scene_hash: str) ->
     return file_sha256(path)
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
-    raise SystemExit(128 + number)
+def _note(number: int, frame: FrameType | None) -> None:
+    """Remember the signal; raising here could strike the pool's own code or a destructor, which print a traceback."""
+    _state["signal"] = number
 
 
 def _check_stop() -> None:
     event = _state["stop"]
     if event is None:
         return
+    if "signal" in _state:
+        raise SystemExit(128 + _state["signal"])
     if event.is_set():
         raise Stopped
     if os.getppid() != _state["parent"]:  # the parent was killed: nobody wants the rest
