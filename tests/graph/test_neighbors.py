@@ -4,10 +4,13 @@ import torch
 from scipy.spatial import cKDTree
 
 from vpd_lightning.errors import NonFiniteError, VPDError
-from vpd_lightning.graph.neighbors import BACKENDS, PointIndex, automatic_backend, knn, radius
+from vpd_lightning.graph.neighbors import BACKENDS, PointIndex, knn, radius
 
+# Triton searches on a GPU or in its interpreter: see test_neighbors_triton.py.
 ALL_BACKENDS = [
-    pytest.param(name, marks=pytest.mark.cluster) if name == "torch_cluster" else name for name in (*BACKENDS, "auto")
+    pytest.param(name, marks=pytest.mark.cluster) if name == "torch_cluster" else name
+    for name in (*BACKENDS, "auto")
+    if name != "triton"
 ]
 SIZES = [0, 1, 15, 16, 17, 63, 1000]
 
@@ -146,23 +149,8 @@ def test_unknown_backends_and_negative_numbers_are_refused() -> None:
         radius(cloud(3), cloud(3), -0.1)
 
 
-def test_auto_is_a_fixed_rule() -> None:
-    cpu = torch.device("cpu")
-    assert automatic_backend(cpu, 10) == "torch"
-    assert automatic_backend(cpu, 16384) == "scipy"
-    assert automatic_backend(cpu, 1024, is_radius=True) == "torch"
-    assert automatic_backend(torch.device("cuda"), 16384) == "torch"
-
-
-@pytest.mark.cluster
-def test_the_graph_takes_torch_cluster_where_it_is_installed_and_the_renderer_does_not():
-    for device in (torch.device("cpu"), torch.device("cuda")):
-        assert automatic_backend(device, 1024, is_graph=True) == "torch_cluster"
-        assert automatic_backend(device, 16384) != "torch_cluster"
-
-
 @pytest.mark.gpu
-@pytest.mark.parametrize("backend", ALL_BACKENDS)
+@pytest.mark.parametrize("backend", [*ALL_BACKENDS, "triton"])
 def test_cuda_tensors_give_the_same_distances(backend: str) -> None:
     points, queries = cloud(500, torch.float32), cloud(70, torch.float32)
     neighbors = knn(points.cuda(), queries.cuda(), 16, 0.5, backend)

@@ -29,10 +29,17 @@ too old.
 
 # What an optional package is for, and how to get it.
 _EXTRAS = {
-    "torch-cluster": ("a neighbour backend for GPUs", "make cluster"),
+    "torch-cluster": ("a neighbour backend", "make cluster"),
+    "triton": ("fast kernels on GPUs", "pip install triton (PyTorch for CUDA brings it along)"),
     "wandb": ("logger=wandb", "pip install wandb"),
 }
-_NEIGHBOR_BACKENDS = {"torch": "torch", "scipy": "scipy", "torch_cluster": "torch_cluster"}
+_NEIGHBOR_BACKENDS = {
+    "torch": "torch",
+    "scipy": "scipy",
+    "numba": "numba",
+    "torch_cluster": "torch_cluster",
+    "triton": "triton",
+}
 _GL_PACKAGES = (
     "apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0 libgl1 (EGL), or libosmesa6 (OSMesa); "
     "renderer=raycast needs neither"

@@ -1,7 +1,7 @@
 """Brute force in plain PyTorch, in chunks: the definition of "correct", on any device and in any float type."""
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vpd_lightning.graph.neighbors.contract import Neighbors, padded
@@ -19,7 +19,10 @@ class ReferenceSearch:
     No ``torch.cdist``: its matrix-product form loses the digits that the kernels live on.
     """
 
-    def __init__(self, points: Float[Tensor, "point 3"]) -> None:
+    def __init__(self, points: Float[Tensor, "point 3"], mask: Bool[Tensor, " point"] | None = None) -> None:
+        if mask is not None:
+            # Infinitely far away is never found, and no shape depends on the mask.
+            points = points.masked_fill(~mask[:, None], torch.inf)
         self._columns = points.t().contiguous()
         self._rows = max(1, _PAIRS_PER_CHUNK.get(points.device.type, 1 << 22) // max(1, len(points)))
 
@@ -35,6 +38,8 @@ class ReferenceSearch:
         self, queries: Float[Tensor, "query 3"], max_radius: float
     ) -> tuple[Int64[Tensor, " edge"], Int64[Tensor, " edge"]]:
         """Return all (point, query) pairs within ``max_radius``, sorted by query, then by point."""
+        # Infinitely far (masked, or beyond the range of squares) is outside of every radius.
+        max_radius = min(max_radius, torch.finfo(queries.dtype).max)
         pairs = []
         for first, chunk in enumerate(queries.split(self._rows)):
             close = (self._squared_distances(chunk).sqrt_() <= max_radius).nonzero()
