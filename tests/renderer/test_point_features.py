@@ -39,6 +39,20 @@ def test_missing_neighbors_add_nothing(count: int) -> None:
         assert not bool(many.any())
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_a_masked_entry_points_at_does_not_get_through(bad: float) -> None:
+    positions, features = torch.rand(5, 3), torch.rand(5, 2)
+    positions[0], features[0] = bad, bad
+    index, mask = torch.tensor([[3, 0, 4]]), torch.tensor([[True, False, True]])
+    masked = Neighbors(index, torch.zeros(1, 3), mask)
+    shorter = Neighbors(index[:, ::2], torch.zeros(1, 2), mask[:, ::2])
+    queries, particles = torch.rand(1, 3), Particles(positions, features)
+    found = annular_features(queries, particles, masked, RADII, BANDWIDTHS)
+    assert bool(torch.isfinite(found).all())
+    # Adding zeros changes nothing; the product may sum in another order.
+    torch.testing.assert_close(found, annular_features(queries, particles, shorter, RADII, BANDWIDTHS))
+
+
 def test_a_batch_equals_its_members() -> None:
     positions, features = torch.rand(3, 20, 3), torch.rand(3, 20, 5)
     queries = torch.rand(3, 8, 3)
@@ -119,6 +133,8 @@ def test_impossible_kernels_are_refused_by_name() -> None:
         ((), (), "not empty"),
         ((-0.1,), (0.1,), "kernel_radii"),
         ((0.1,), (0.0,), "kernel_bandwidths"),
+        ((math.inf,), (0.1,), "kernel_radii"),
+        ((0.1,), (math.inf,), "kernel_bandwidths"),
     ):
         with pytest.raises(ValueError, match=name):
             check_kernels(radii, bandwidths)
