@@ -1,3 +1,5 @@
+from importlib.util import find_spec
+
 import pytest
 import torch
 
@@ -5,7 +7,7 @@ from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.graph.neighbors import knn
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.point_features import annular_features
-from vpd_lightning.renderer.ray_candidates import depth_hints, ray_candidates, ray_features
+from vpd_lightning.renderer.ray_candidates import CandidateTable, RayCandidates, depth_hints, ray_features
 from vpd_lightning.renderer.surface import SurfaceRenderer
 from vpd_lightning.types import Particles, Rays, RenderedRays
 
@@ -31,7 +33,9 @@ SMALL = {
     "background_width": 8,
     "ray_chunk_size": 1000,
     "checkpoint_chunks": False,
+    "candidate_backend": "auto",
 }
+BACKENDS = ["torch", pytest.param("numba", marks=pytest.mark.skipif(not find_spec("numba"), reason="needs numba"))]
 
 
 def renderer_of(**changes: object) -> SurfaceRenderer:
@@ -53,15 +57,23 @@ def rays_of(batch: int = 2, count: int = 7) -> Rays:
     return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1))
 
 
+def ray_candidates(
+    particles: Particles, rays: Rays, count: int, near: float, far: float, backend: str = "torch"
+) -> RayCandidates:
+    table = CandidateTable(particles, backend)
+    return table.seen_from(rays, table.closest(rays, count, near, far))
+
+
 def assert_same(first: RenderedRays, second: RenderedRays) -> None:
     # Matrix products of another size may be summed in another order.
     for name in ("rgbs", "depths", "opacities"):
         torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=1e-9, atol=1e-9)
 
 
-def test_candidates_are_the_particles_nearest_to_the_ray() -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_candidates_are_the_particles_nearest_to_the_ray(backend: str) -> None:
     particles, rays = scene(), rays_of()
-    found = ray_candidates(particles, rays, 8, 0.5, 6.0)
+    found = ray_candidates(particles, rays, 8, 0.5, 6.0, backend)
     offset = particles.positions[:, None] - rays.origins[:, :, None]
     along = (offset * rays.directions[:, :, None]).sum(dim=-1)
     across = torch.linalg.cross(offset, rays.directions[:, :, None].expand_as(offset)).norm(dim=-1)
@@ -73,10 +85,11 @@ def test_candidates_are_the_particles_nearest_to_the_ray() -> None:
     )
 
 
-def test_particles_behind_the_camera_are_no_candidates() -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_particles_behind_the_camera_are_no_candidates(backend: str) -> None:
     particles = Particles(torch.tensor([[[-1.0, 0, 0], [1.0, 0, 0]]]), torch.rand(1, 2, 3))
     rays = Rays(torch.zeros(1, 1, 3), torch.tensor([[[1.0, 0, 0]]]))
-    found = ray_candidates(particles, rays, 2, 0.1, 5.0)
+    found = ray_candidates(particles, rays, 2, 0.1, 5.0, backend)
     assert found.mask.sum() == 1 and found.along[found.mask].item() == pytest.approx(1.0)
 
 
@@ -85,11 +98,53 @@ def test_ray_features_equal_annular_features_of_the_same_particles() -> None:
     t = torch.linspace(2.0, 4.0, 5, dtype=torch.float64).expand(1, 7, 5)
     found = ray_candidates(particles, rays, 12, 0.0, 100.0)
     assert bool(found.mask.all())
-    features = ray_features(found, t, 4, RADII, BANDWIDTHS)
+    features = ray_features(found, t, 4, RADII, BANDWIDTHS, "torch")
     points = (rays.origins[0, :, None] + t[0, ..., None] * rays.directions[0, :, None]).flatten(0, 1)
     one = Particles(particles.positions[0], particles.features[0])
     expected = annular_features(points, one, knn(one.positions, points, 4), RADII, BANDWIDTHS)
     torch.testing.assert_close(features.flatten(0, 2), expected, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.skipif(not find_spec("numba"), reason="needs numba")
+@pytest.mark.parametrize(("count", "num_neighbors", "width"), [(1, 1, 1), (7, 3, 5), (12, 12, 16), (24, 16, 16)])
+def test_compiled_features_and_gradients_equal_the_plain_ones(count: int, num_neighbors: int, width: int) -> None:
+    values = [torch.rand(2, 9, count) + 1, torch.rand(2, 9, count) * 0.5, torch.rand(2, 9, count, width)]
+    mask, t = torch.rand(2, 9, count) > 0.2, torch.rand(2, 9, 5) + 1
+    mask[0, 0] = False
+    values[1][0, 1, 0], t[0, 1, 0], mask[0, 1, 0] = 0.0, values[0][0, 1, 0], True  # a sample on a particle
+    results = []
+    # Against the plain sums in float64, so that the difference is the compiled twin's own rounding.
+    for dtype, backend in ((torch.float64, "torch"), (torch.float32, "numba")):
+        inputs = [value.to(dtype).requires_grad_() for value in values]
+        radii, bandwidths = (0.0, 0.05, 0.3), (0.05, 0.02, 0.4)  # exp(-(0.5 / 0.02)^2) is below float32's range
+        features = ray_features(RayCandidates(*inputs, mask), t.to(dtype), num_neighbors, radii, bandwidths, backend)
+        assert features.dtype == dtype
+        weights = torch.linspace(-1, 1, features.numel(), dtype=dtype).view(features.shape)
+        results.append(
+            (features.float(), *(g.float() for g in torch.autograd.grad((weights * features).sum(), inputs)))
+        )
+    # Distances of about 1 carry 1e-7; a bandwidth of 0.02 makes 2e-5 of it, its gradient 1e-3 of 50.
+    for plain, compiled, tolerance in zip(*results, (1e-5, 2e-3, 2e-3, 1e-4), strict=True):
+        torch.testing.assert_close(compiled, plain, rtol=1e-4, atol=tolerance)
+
+
+@pytest.mark.skipif(not find_spec("numba"), reason="needs numba")
+def test_backends_draw_the_same_picture_and_give_the_same_gradients() -> None:
+    particles, rays, keys = scene(count=300).to(torch.float32), rays_of(count=60).to(torch.float32), RandomKeys.fixed(2)
+    results = []
+    for backend in ("torch", "numba"):
+        in_parts = {"checkpoint_chunks": True, "ray_chunk_size": 50} if backend == "numba" else {}
+        renderer = renderer_of(candidate_backend=backend, **in_parts).float()
+        positions = particles.positions.clone().requires_grad_()
+        features = particles.features.clone().requires_grad_()
+        rendered = renderer(Particles(positions, features), rays, keys)
+        loss = rendered.rgbs.square().sum() + rendered.depths.sum()
+        results.append((rendered, torch.autograd.grad(loss, [positions, features, *renderer.parameters()])))
+    # float32: hints are differences of distances of 3, densities are per 0.2.
+    torch.testing.assert_close(results[1][0].rgbs, results[0][0].rgbs, rtol=0, atol=1e-4)
+    torch.testing.assert_close(results[1][0].depths, results[0][0].depths, rtol=0, atol=1e-3)
+    for one, other in zip(results[0][1], results[1][1], strict=True):
+        assert float((one - other).norm()) <= 1e-3 * float(one.norm())
 
 
 def test_hints_lie_on_the_nearest_surface_and_beside_an_edge_on_both() -> None:
@@ -205,7 +260,14 @@ def test_a_particle_that_is_not_a_number_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("near", 7.0), ("num_uniform_samples", 8), ("num_neighbors", 9), ("footprint", 0.0), ("background_width", 0)],
+    [
+        ("near", 7.0),
+        ("num_uniform_samples", 8),
+        ("num_neighbors", 9),
+        ("footprint", 0.0),
+        ("background_width", 0),
+        ("candidate_backend", "fast"),
+    ],
 )
 def test_values_out_of_range_are_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=name):

@@ -7,12 +7,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.renderer.point_features import kernel_weights, safe_norm
 from vpd_lightning.renderer.precision import at_least_float32, full_precision
+from vpd_lightning.renderer.ray_search import BesideRay, Candidates, RaySearch, resolved_backend
 from vpd_lightning.types import Particles, Rays
-
-_PAIRS_PER_CHUNK = {"cpu": 1 << 20, "cuda": 1 << 26}
 
 
 @dataclass(frozen=True)
@@ -25,78 +23,49 @@ class RayCandidates:
     mask: Bool[Tensor, "batch ray candidate"]
 
 
-def ray_candidates(particles: Particles, rays: Rays, num_candidates: int, near: float, far: float) -> RayCandidates:
-    """Return the ``num_candidates`` valid particles nearest to each ray among those between ``near`` and ``far``.
+class CandidateTable:
+    """The particles of a batch, prepared once, from which chunks of rays take their candidates."""
 
-    The choice uses matrix products (class "approximate": ranks of almost equal distances may swap); what is returned is
-    computed again by differences. Rays with fewer such particles have the rest masked.
+    def __init__(self, particles: Particles, backend: str) -> None:
+        """Prepare the search and one table of positions and features.
 
-    Raises:
-        NonFiniteError: when a valid particle or a ray is not finite.
-    """
-    with full_precision(rays.origins):
-        positions = at_least_float32(particles.positions)
-        origins = at_least_float32(rays.origins).to(positions.dtype)
-        directions = at_least_float32(rays.directions).to(positions.dtype)
-        batch_size, num_particles = positions.shape[:2]
-        num_rays = origins.shape[1]
-        index, mask = _closest(positions.detach(), particles.mask, origins, directions, num_candidates, near, far)
-        flat = index + num_particles * torch.arange(batch_size, device=index.device)[:, None, None]
-        table = torch.cat([positions, at_least_float32(particles.features).to(positions.dtype)], dim=-1).flatten(0, 1)
-        if num_particles == 0:
-            table = table.new_zeros(1, table.shape[1])
-        gathered = table.index_select(0, flat.reshape(-1)).view(batch_size, num_rays, num_candidates, table.shape[1])
-        offset = gathered[..., :3] - origins[:, :, None]
-        along = (offset * directions[:, :, None]).sum(dim=-1)
-        across = safe_norm(offset - along[..., None] * directions[:, :, None])
-        return RayCandidates(along, across, gathered[..., 3:], mask)
+        Raises:
+            NonFiniteError: when a valid particle is not finite.
+            ValueError: when the backend is unknown.
+        """
+        with full_precision(particles.positions):
+            positions = at_least_float32(particles.positions)
+            self.search = RaySearch(positions, particles.mask, backend)
+            self.num_particles = particles.num_particles
+            features = at_least_float32(particles.features).to(positions.dtype)
+            self.rows = torch.cat([positions, features], dim=-1).flatten(0, 1)
+            if self.num_particles == 0:
+                self.rows = self.rows.new_zeros(1, self.rows.shape[1])
 
+    def closest(self, rays: Rays, num_candidates: int, near: float, far: float) -> Candidates:
+        """Return the ``num_candidates`` valid particles nearest to each ray among those between ``near`` and ``far``.
 
-def require_finite(*tensors: Tensor) -> None:
-    """Raise NonFiniteError unless positions and rays are finite; one pass over each, no copy of a mask."""
-    if not bool(torch.isfinite(sum(tensor.sum() for tensor in tensors))):  # type: ignore[arg-type]
-        raise NonFiniteError(
-            "Rendering: a particle position or a ray is NaN or infinite.\n"
-            "A model that diverged, or damaged poses; lower the learning rate or check the data with vpd-data validate."
-        )
+        Rays with fewer such particles have the rest masked.
 
+        Raises:
+            NonFiniteError: when a ray is not finite.
+        """
+        origins, directions = at_least_float32(rays.origins), at_least_float32(rays.directions)
+        return self.search.closest(origins, directions, num_candidates, BesideRay(near, far))
 
-@torch.no_grad()
-def _closest(
-    positions: Float[Tensor, "batch particle 3"],
-    valid: Bool[Tensor, "batch particle"],
-    origins: Float[Tensor, "batch ray 3"],
-    directions: Float[Tensor, "batch ray 3"],
-    num_candidates: int,
-    near: float,
-    far: float,
-) -> tuple[Tensor, Bool[Tensor, "batch ray candidate"]]:
-    positions = torch.where(valid[..., None], positions, 0.0)
-    require_finite(positions, origins, directions)
-    batch_size, num_particles = positions.shape[:2]
-    num_rays = origins.shape[1]
-    index = torch.zeros((batch_size, num_rays, num_candidates), dtype=torch.int64, device=positions.device)
-    mask = torch.zeros_like(index, dtype=torch.bool)
-    count = min(num_candidates, num_particles)
-    if count == 0:
-        return index, mask
-    # |p - o|^2 - ((p - o) . d)^2, both as products of [p, |p|^2, 1]; centred, so that little cancels.
-    center = positions.mean(dim=1, keepdim=True)
-    p, o = positions - center, origins - center
-    one = torch.ones_like(p[..., :1])
-    lifted = torch.cat([p, p.square().sum(-1, keepdim=True), one], dim=-1).transpose(1, 2)
-    distance = torch.cat([-2 * o, torch.ones_like(o[..., :1]), o.square().sum(-1, keepdim=True)], dim=-1)
-    along_ray = -(o * directions).sum(-1, keepdim=True)
-    depth = torch.cat([directions, torch.zeros_like(along_ray), along_ray], dim=-1)
-    step = max(1, _PAIRS_PER_CHUNK.get(positions.device.type, 1 << 22) // (batch_size * num_particles))
-    for start in range(0, num_rays, step):
-        chunk = slice(start, start + step)
-        along = depth[:, chunk] @ lifted
-        squared = torch.baddbmm(along.square(), distance[:, chunk], lifted, beta=-1)
-        squared.masked_fill_((along < near) | (along > far) | ~valid[:, None], torch.inf)
-        best, index[:, chunk, :count] = squared.topk(count, dim=-1, largest=False, sorted=False)
-        mask[:, chunk, :count] = best < torch.inf
-    return index.masked_fill_(~mask, 0), mask
+    def seen_from(self, rays: Rays, found: Candidates) -> RayCandidates:
+        """Return where candidates are as seen from their rays: differences, whatever the backend that chose them."""
+        with full_precision(rays.origins):
+            origins = at_least_float32(rays.origins).to(self.rows.dtype)[:, :, None]
+            directions = at_least_float32(rays.directions).to(self.rows.dtype)[:, :, None]
+            index = found.index
+            if len(index) > 1:
+                index = index + self.num_particles * torch.arange(len(index), device=index.device)[:, None, None]
+            gathered = self.rows.index_select(0, index.reshape(-1)).view(*index.shape, self.rows.shape[1])
+            offset = gathered[..., :3] - origins
+            along = (offset * directions).sum(dim=-1)
+            across = safe_norm(offset - along[..., None] * directions)
+            return RayCandidates(along, across, gathered[..., 3:], found.mask)
 
 
 def ray_features(
@@ -105,12 +74,21 @@ def ray_features(
     num_neighbors: int,
     kernel_radii: Sequence[float],
     kernel_bandwidths: Sequence[float],
+    backend: str,
 ) -> Float[Tensor, "batch ray sample kernel_feature"]:
     """Return annular features of samples at ``t`` from the ``num_neighbors`` nearest candidates of their ray.
 
     The same sums as ``annular_features``. The distance is taken in ray coordinates,
     ``sqrt(across^2 + (t - along)^2)``, so that candidates are gathered once per ray and not once per sample.
+    Backend ``numba`` is for float32 and for ``t`` without gradient; else, the sums are the plain ones.
     """
+    tensors = (candidates.along, candidates.across, candidates.features, candidates.mask, t)
+    is_compiled = resolved_backend(backend, t.device) == "numba" and not t.requires_grad
+    if is_compiled and all(tensor.dtype in (torch.float32, torch.bool) for tensor in tensors):
+        from vpd_lightning.renderer.ray_features_numba import RayFeatures
+
+        flat = [tensor.flatten(0, 1) for tensor in tensors]
+        return RayFeatures.apply(*flat, num_neighbors, kernel_radii, kernel_bandwidths).unflatten(0, t.shape[:2])
     with full_precision(t):
         behind = t[..., None] - candidates.along[..., None, :]
         squared = candidates.across.square()[..., None, :] + behind.square()

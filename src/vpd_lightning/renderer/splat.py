@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
-from vpd_lightning.renderer.ray_candidates import require_finite
+from vpd_lightning.renderer.ray_search import BesideAndBehind, RaySearch, check_backend
 from vpd_lightning.types import Particles, Rays, RenderedRays
 
 
@@ -36,8 +36,10 @@ class SplatRenderer(AbstractRenderer):
         near: float,
         far: float,
         ray_chunk_size: int,
+        candidate_backend: str,
     ):
         super().__init__()
+        check_backend(candidate_backend)
         if min(kernel_scales) <= 0 or layer_depth <= 0:
             raise ValueError(f"kernel_scales {list(kernel_scales)} and layer_depth {layer_depth} must be positive")
         if num_candidates < 1 or ray_chunk_size < 1:
@@ -47,6 +49,7 @@ class SplatRenderer(AbstractRenderer):
         if not 0 <= near < far:
             raise ValueError(f"near must lie in [0, far), got near={near}, far={far}")
         self.num_candidates, self.layer_depth, self.near, self.far = num_candidates, layer_depth, near, far
+        self.candidate_backend = candidate_backend
         self.kernel_scales, self.ray_chunk_size = list(kernel_scales), ray_chunk_size
         num_scales = len(self.kernel_scales)
         layer_dim = num_scales * (feature_dim + 4) + 1
@@ -67,19 +70,20 @@ class SplatRenderer(AbstractRenderer):
                 features=pad(particles.features, (0, 0, 0, 1)),
                 mask=pad(particles.mask, (0, 1)),
             )
+        index = self._candidates(particles, rays.origins, rays.directions)
+        slices = [slice(s, s + self.ray_chunk_size) for s in range(0, max(num_rays, 1), self.ray_chunk_size)]
         chunks = [
-            self._render(
-                particles, rays.origins[:, s : s + self.ray_chunk_size], rays.directions[:, s : s + self.ray_chunk_size]
-            )
-            for s in range(0, max(num_rays, 1), self.ray_chunk_size)
+            self._render(particles, index[:, some], rays.origins[:, some], rays.directions[:, some]) for some in slices
         ]
         rgbs, depths, opacities = (torch.cat(parts, dim=1) for parts in zip(*chunks, strict=True))
         return RenderedRays(rgbs, depths, opacities)
 
-    def _render(self, particles: Particles, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _render(
+        self, particles: Particles, index: Tensor, origins: Tensor, directions: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         device_type = origins.device.type
         with torch.autocast(device_type, enabled=False):
-            inputs, depth = self._layers(particles, origins, directions)
+            inputs, depth = self._layers(particles, index, origins, directions)
         outputs = self.network(torch.cat([inputs, directions], dim=-1)).to(origins.dtype)
         colors = torch.sigmoid(outputs[..., :6]).unflatten(-1, (2, 3))
         alphas = torch.sigmoid(outputs[..., 6:] + 1.0)
@@ -92,12 +96,12 @@ class SplatRenderer(AbstractRenderer):
         depths = (front * depth[..., :1] + back * depth[..., 1:] + left * self.far).squeeze(-1)
         return rgbs, depths, (front + back).squeeze(-1)
 
-    def _layers(self, particles: Particles, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    def _layers(
+        self, particles: Particles, index: Tensor, origins: Tensor, directions: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the network's inputs (``batch ray input``) and the two layers' distances along the ray."""
-        with torch.no_grad():
-            index = self._candidates(particles, origins, directions)
         batch = torch.arange(len(index), device=index.device)[:, None, None]
-        flat = (batch * particles.num_particles + index).flatten()
+        flat = (batch * particles.num_particles + index.clamp(min=0)).flatten()
 
         def gather(values: Tensor) -> Tensor:  # index_select: its backward is an index_add, much the fastest on CPU
             return values.flatten(0, 1).index_select(0, flat).unflatten(0, index.shape)
@@ -106,13 +110,15 @@ class SplatRenderer(AbstractRenderer):
         along = (offsets * directions[:, :, None]).sum(dim=-1)
         beside = offsets - along[..., None] * directions[:, :, None]
         square = beside.square().sum(dim=-1)
-        usable = gather(particles.mask[..., None]).squeeze(-1) & (along > self.near)
+        usable = gather(particles.mask[..., None]).squeeze(-1) & (along > self.near) & (index >= 0)
+        # What cannot be used counts for nearly nothing; a slot without a particle for nothing at all.
+        floor = torch.where(index >= 0, -30.0, -1e4).to(along.dtype)
         features = gather(particles.features)
 
         in_front = (self._front(along, square, usable) + self.layer_depth - along) / (0.3 * self.layer_depth)
         inputs, depths = [], []
         for membership in (nn.functional.logsigmoid(in_front), nn.functional.logsigmoid(-in_front)):
-            membership = membership.masked_fill(~usable, -30.0).clamp(min=-30.0)
+            membership = torch.where(usable, membership.clamp(min=-30.0), floor)
             for number, scale in enumerate(self.kernel_scales):
                 logits = membership - square / (2 * scale**2)
                 weights = torch.softmax(logits, dim=-1)
@@ -134,72 +140,13 @@ class SplatRenderer(AbstractRenderer):
         set_back = along + 2 * square.sqrt()
         return set_back.masked_fill(~usable, self.far).amin(dim=-1, keepdim=True)
 
+    @torch.no_grad()
     def _candidates(
         self, particles: Particles, origins: Tensor, directions: Tensor
     ) -> Int[Tensor, "batch ray candidate"]:
-        """Choose the particles closest to each ray; those behind the camera, hidden or padded come last."""
-        known = torch.where(particles.mask[..., None], particles.positions, 0.0)
-        require_finite(known, origins, directions)
-        center = known.mean(dim=1, keepdim=True)
-        positions, eyes = known - center, origins - center
-        index = [
-            torch.cat(
-                [
-                    self._search(
-                        positions[m],
-                        particles.mask[m],
-                        eyes[m, s : s + _SEARCH_BLOCK],
-                        directions[m, s : s + _SEARCH_BLOCK],
-                    )
-                    for s in range(0, max(eyes.shape[1], 1), _SEARCH_BLOCK)
-                ]
-            )
-            for m in range(len(positions))
-        ]
-        return torch.stack(index)
-
-    def _search(
-        self,
-        positions: Float[Tensor, "particle 3"],
-        mask: Bool[Tensor, " particle"],
-        eyes: Float[Tensor, "ray 3"],
-        directions: Float[Tensor, "ray 3"],
-    ) -> Int[Tensor, "ray candidate"]:
-        """Score all pairs of a block of rays and return the best particles of each ray.
-
-        The pairs are the renderer's only quadratic part, so they are few passes over one array that stays in cache:
-        two matrix products give distance along and squared distance beside the ray, conditions are sums of ramps. The
-        products lose digits, which may change the last candidates; the chosen ones are measured anew without them.
-        """
-        ones = torch.ones_like(positions[:, :1])
-        square_norm = positions.square().sum(dim=-1, keepdim=True) + 1e6 * ~mask[:, None]
-        lines = torch.cat([directions, -(eyes * directions).sum(dim=-1, keepdim=True)], dim=-1)
-        along = lines @ torch.cat([positions, ones], dim=-1).mT
-        points = torch.cat([-2 * eyes, torch.ones_like(eyes[:, :1]), eyes.square().sum(dim=-1, keepdim=True)], dim=-1)
-        square = points @ torch.cat([positions, square_norm, ones], dim=-1).mT
-        square.addcmul_(along, along, value=-1.0)
-        along.add_((self.near - along).clamp_(min=0), alpha=1e4)  # behind the camera counts as far away
-        beside = (square - (0.5 * self.kernel_scales[-1]) ** 2).clamp_(min=0)
-        first = torch.add(along, beside, alpha=1e4).amin(dim=-1, keepdim=True)
-        behind = along.sub_(first + 3 * self.layer_depth).clamp_(min=0)
-        return smallest(square.addcmul_(behind, behind, value=0.04), self.num_candidates)
-
-
-_SEARCH_BLOCK = 256  # rays; 256 x 1,280 float32 scores are 1.3 MB
-
-
-def smallest(scores: Float[Tensor, "ray particle"], count: int) -> Int[Tensor, "ray candidate"]:
-    """Return the indices of the ``count`` smallest scores of each row, in no order; exact.
-
-    The smallest lie in the ``count`` groups of eight whose best is smallest: most scores only pass through a minimum.
-    """
-    num_rays, num_particles = scores.shape
-    count, group = min(count, num_particles), 8
-    if num_particles < 4 * count * group // 2:
-        return scores.topk(count, dim=-1, largest=False, sorted=False).indices
-    padding = -num_particles % group
-    groups = nn.functional.pad(scores, (0, padding), value=float("inf")).view(num_rays, -1, group)
-    best = groups.amin(dim=-1).topk(count, dim=-1, largest=False, sorted=False).indices
-    members = torch.gather(groups, 1, best[..., None].expand(-1, -1, group)).flatten(1)
-    chosen = members.topk(count, dim=-1, largest=False, sorted=False).indices
-    return torch.gather(best, 1, chosen // group) * group + chosen % group
+        """Choose the particles closest to each ray, hidden ones and those behind the camera last; -1 for none."""
+        score = BesideAndBehind(self.near, 0.5 * self.kernel_scales[-1], 3 * self.layer_depth)
+        count = min(self.num_candidates, particles.num_particles)
+        search = RaySearch(particles.positions, particles.mask, self.candidate_backend)
+        found = search.closest(origins, directions, count, score)
+        return torch.where(found.mask, found.index, -1)

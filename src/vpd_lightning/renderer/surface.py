@@ -14,7 +14,8 @@ from vpd_lightning.renderer.point_features import check_kernels
 from vpd_lightning.renderer.positional_encoding import encoding_dim, positional_encoding
 from vpd_lightning.renderer.precision import at_least_float32, full_precision
 from vpd_lightning.renderer.radiance_field import RadianceField
-from vpd_lightning.renderer.ray_candidates import RayCandidates, depth_hints, ray_candidates, ray_features
+from vpd_lightning.renderer.ray_candidates import CandidateTable, RayCandidates, depth_hints, ray_features
+from vpd_lightning.renderer.ray_search import Candidates, check_backend
 from vpd_lightning.renderer.volumetric import composite
 from vpd_lightning.types import Particles, Rays, RenderedRays
 
@@ -58,9 +59,11 @@ class SurfaceRenderer(AbstractRenderer):
         background_width: int,
         ray_chunk_size: int,
         checkpoint_chunks: bool,
+        candidate_backend: str,
     ) -> None:
         super().__init__()
         check_kernels(kernel_radii, kernel_bandwidths)
+        check_backend(candidate_backend)
         if not 0 <= near < far:
             raise ValueError(f"near and far must satisfy 0 <= near < far, got near={near} and far={far}.")
         if not 0 <= num_uniform_samples < num_samples:
@@ -86,6 +89,7 @@ class SurfaceRenderer(AbstractRenderer):
         self.view_degree = view_degree
         self.ray_chunk_size = ray_chunk_size
         self.checkpoint_chunks = checkpoint_chunks
+        self.candidate_backend = candidate_backend
         self.field = RadianceField(
             input_dim=feature_dim * len(kernel_radii),
             net_depth=net_depth,
@@ -114,20 +118,23 @@ class SurfaceRenderer(AbstractRenderer):
             noise = rays.origins.new_full((batch_size, *shape), 0.5, dtype=torch.float32)
         else:
             noise = uniform_draws(keys, "render/surface", batch_size, shape, rays.origins)
-        parts = [
-            self._render(particles, Rays(rays.origins[:, chunk], rays.directions[:, chunk]), noise[:, chunk])
-            for chunk in ray_slices(num_rays, batch_size, self.ray_chunk_size)
-        ]
+        table = CandidateTable(particles, self.candidate_backend)
+        found = table.closest(rays, self.num_candidates, self.near, self.far)
+        parts = []
+        for chunk in ray_slices(num_rays, batch_size, self.ray_chunk_size):
+            some = Rays(rays.origins[:, chunk], rays.directions[:, chunk])
+            candidates = table.seen_from(some, Candidates(found.index[:, chunk], found.mask[:, chunk]))
+            parts.append(self._render(candidates, some, noise[:, chunk]))
         return joined(parts)
 
-    def _render(self, particles: Particles, rays: Rays, noise: Float[Tensor, "batch ray draw"]) -> RenderedRays:
-        candidates = ray_candidates(particles, rays, self.num_candidates, self.near, self.far)
+    def _render(self, candidates: RayCandidates, rays: Rays, noise: Float[Tensor, "batch ray draw"]) -> RenderedRays:
         t = self._samples(candidates, noise.to(candidates.along.dtype))
         directions = at_least_float32(rays.directions)
 
         def seen(along: Tensor, across: Tensor, latents: Tensor) -> tuple[Tensor, Tensor]:
             some = RayCandidates(along, across, latents, candidates.mask)
-            features = ray_features(some, t, self.num_neighbors, self.kernel_radii, self.kernel_bandwidths)
+            kernels = self.kernel_radii, self.kernel_bandwidths
+            features = ray_features(some, t, self.num_neighbors, *kernels, self.candidate_backend)
             return self.field(features, directions)
 
         sigmas, rgbs = recomputed(
