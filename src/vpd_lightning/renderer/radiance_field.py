@@ -68,7 +68,7 @@ class RadianceField(nn.Module):
         for index in range(net_depth):
             width = input_dim if index == 0 else net_width + (input_dim if takes_input[index] else 0)
             self.trunk.append(nn.Linear(width, net_width))
-        self._takes_input = takes_input
+        self.takes_input = takes_input
         self.density = nn.Linear(net_width, 1)
         self.bottleneck = None if view_degree is None else nn.Linear(net_width, net_width)
         view_dim = 0 if view_degree is None else encoding_dim(view_degree)
@@ -93,8 +93,10 @@ class RadianceField(nn.Module):
 
         ``directions`` are unit vectors, one per ray. Without ``use_color`` the colour branch is left out.
         """
+        # Under autocast the first product rounds the features; the skip connection then takes the rounded ones too.
+        features = features.to(_product_dtype(features))
         hidden = features
-        for layer, takes_input in zip(self.trunk, self._takes_input, strict=True):
+        for layer, takes_input in zip(self.trunk, self.takes_input, strict=True):
             hidden = (_two_inputs(layer, hidden, features) if takes_input else layer(hidden)).relu_()
         if not use_color:
             return self._activated(self.density(hidden)), None
@@ -104,7 +106,7 @@ class RadianceField(nn.Module):
             if directions is None:
                 raise ValueError("This radiance field was built with view directions, but none were given.")
             with full_precision(directions):
-                encoded = positional_encoding(at_least_float32(directions), self.view_degree).to(features.dtype)
+                encoded = positional_encoding(at_least_float32(directions), self.view_degree).to(weight.dtype)
                 # No activation lies between the bottleneck and the next layer, so their product is one small matrix.
                 # All samples of a ray share its direction, so that part is computed once per ray.
                 width = self.bottleneck.out_features
@@ -116,7 +118,7 @@ class RadianceField(nn.Module):
             hidden, torch.cat([weight, self.density.weight]), torch.cat([bias, self.density.bias])
         )
         hidden, raw_density = heads[..., :-1], heads[..., -1:]
-        hidden = functional.relu(hidden if along_ray is None else hidden + along_ray)
+        hidden = functional.relu(hidden if along_ray is None else hidden + along_ray.to(hidden.dtype))
         return self._activated(raw_density), torch.sigmoid(at_least_float32(self.color(hidden)))
 
     def _activated(self, raw_density: Float[Tensor, "*shape 1"]) -> Float[Tensor, "*shape"]:
@@ -124,11 +126,17 @@ class RadianceField(nn.Module):
         return activation(at_least_float32(raw_density).squeeze(-1))
 
 
+def _product_dtype(tensor: Tensor) -> torch.dtype:
+    """The precision of matrix products: autocast's where that is on."""
+    device = tensor.device.type
+    return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else tensor.dtype
+
+
 def _two_inputs(layer: nn.Linear, first: Tensor, second: Tensor) -> Tensor:
     """Apply ``layer`` to the concatenation of two inputs without writing the concatenation down."""
     width = first.shape[-1]
-    total = functional.linear(second, layer.weight[:, width:], layer.bias)
-    if total.dtype == layer.weight.dtype == first.dtype:
-        total.flatten(0, -2).addmm_(first.flatten(0, -2), layer.weight[:, :width].t())
-        return total
-    return total + functional.linear(first, layer.weight[:, :width])
+    # Under autocast products in place take what they are given, so the weights are rounded here.
+    weight = layer.weight.to(first.dtype)
+    total = functional.linear(second, weight[:, width:], layer.bias.to(first.dtype))
+    total.flatten(0, -2).addmm_(first.flatten(0, -2), weight[:, :width].t())
+    return total
