@@ -16,6 +16,9 @@ SMALL = {
     "r_s": 0.4,
     "r_a_s": 0.9,
     "location_scale": 0.1,
+    "edge_capacity": None,
+    "max_abstract_edges_per_node": None,
+    "compile": False,
     "neighbors_backend": "auto",
 }
 

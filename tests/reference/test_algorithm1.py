@@ -22,7 +22,7 @@ def _dynamics() -> HierarchicalGNNDynamics:
     dynamics = HierarchicalGNNDynamics(
         feature_dim=FEATURE_DIM, hidden_dim=HIDDEN_DIM, message_passing_steps=STEPS, num_abstract_nodes=NUM_ABSTRACT,
         max_abstract_neighbors=MAX_NEIGHBORS, r_s=R_S, r_a_s=R_A_S, location_scale=LOCATION_SCALE,
-        neighbors_backend="auto",
+        neighbors_backend="auto", edge_capacity=None, max_abstract_edges_per_node=None, compile=False,
     )  # fmt: skip
     # No weight stays at a value that would hide it: biases and layer norms are random too.
     generator = torch.Generator().manual_seed(0)
@@ -45,7 +45,7 @@ def _particles(seed: int) -> tuple[Particles, Particles]:
 
 def _edges(edge_set: EdgeSet, sender_offset: int, receiver_offset: int, num_receivers: int) -> list[reference.Edge]:
     """The edges of one batch member, counted within it."""
-    pairs = zip(edge_set.senders.tolist(), edge_set.receivers.tolist(), strict=True)
+    pairs = zip(*(ends.tolist() for ends in edge_set.pairs()), strict=True)
     shifted = [(sender - sender_offset, receiver - receiver_offset) for sender, receiver in pairs]
     return [(sender, receiver) for sender, receiver in shifted if 0 <= receiver < num_receivers]
 

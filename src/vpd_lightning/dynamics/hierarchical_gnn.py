@@ -1,16 +1,25 @@
 """The paper's dynamics: hierarchical message passing through abstract nodes (Algorithm 1)."""
 
+import functools
+import importlib.util
+import os
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from vpd_lightning.dynamics.base import AbstractDynamics
-from vpd_lightning.dynamics.blocks import MLP, EdgeUpdater, NodeUpdater, summed_at_receivers
-from vpd_lightning.graph.hierarchical import EdgeSet, HierarchicalGraph, build_graph
+from vpd_lightning.dynamics.blocks import MLP, EdgeUpdater, NodeUpdater
+from vpd_lightning.dynamics.delayed_faults import DelayedFaults
+from vpd_lightning.errors import ConfigError
+from vpd_lightning.graph.hierarchical import EdgeSet, HierarchicalGraph, build_graph, draw_priorities
+from vpd_lightning.graph.incidence import carried
 from vpd_lightning.graph.neighbors import BACKENDS
+from vpd_lightning.graph.static_graph import build_static_graph
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles
 
@@ -37,10 +46,21 @@ class HierarchicalGNNDynamics(AbstractDynamics):
     33,280; message passing 10 * (66,048 + 49,664); abstract -> current edge updater 66,048; particle updater 49,664;
     location decoder 49,923; feature decoder 51,600. Together 1,612,435.
 
+    With ``edge_capacity`` the graph is built with fixed shapes and without asking the device for a number (see
+    ``static_graph``): room for that many edges among the abstract nodes of the whole batch. What does not fit is
+    dropped and counted in ``last_dropped_edges``, and the next call (or ``check_faults``) raises. ``compile`` hands
+    that step to torch.compile; on a GPU it is replayed as a CUDA graph. ``null`` builds exactly the edges there are.
+
+    ``max_abstract_edges_per_node`` is an approximation, off in the paper: an abstract node receives from that many
+    nearest ones only, so that edges grow with the abstract nodes and not with their square.
+
+    Checkpoints from before these three arguments load with null, null and false (``config.migrations``): what they did.
+
     ``last_uncovered_share`` is the share of current particles without abstract node in reach in the last call.
     """
 
     last_uncovered_share: Tensor | None
+    last_dropped_edges: Tensor | None
 
     def __init__(
         self,
@@ -54,6 +74,9 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         r_a_s: float,
         location_scale: float,
         neighbors_backend: str,
+        edge_capacity: int | None,
+        max_abstract_edges_per_node: int | None,
+        compile: bool,
     ) -> None:
         super().__init__()
         counts = {
@@ -61,6 +84,8 @@ class HierarchicalGNNDynamics(AbstractDynamics):
             "hidden_dim": hidden_dim,
             "num_abstract_nodes": num_abstract_nodes,
             "max_abstract_neighbors": max_abstract_neighbors,
+            "edge_capacity": 1 if edge_capacity is None else edge_capacity,
+            "max_abstract_edges_per_node": 1 if max_abstract_edges_per_node is None else max_abstract_edges_per_node,
         }
         for name, count in counts.items():
             if count < 1:
@@ -72,12 +97,17 @@ class HierarchicalGNNDynamics(AbstractDynamics):
                 raise ValueError(f"{name} must be greater than 0 metres, got {value}.")
         if neighbors_backend not in ("auto", *BACKENDS):
             raise ValueError(f"neighbors_backend must be auto or one of {BACKENDS}, got {neighbors_backend!r}.")
+        if compile and edge_capacity is None:
+            raise ValueError("compile=true needs fixed shapes: set edge_capacity, the most edges among abstract nodes.")
         self.num_abstract_nodes = num_abstract_nodes
         self.max_abstract_neighbors = max_abstract_neighbors
         self.r_s, self.r_a_s = float(r_s), float(r_a_s)
         self.location_scale = float(location_scale)
         self.neighbors_backend = neighbors_backend
-        self.last_uncovered_share = None
+        self.edge_capacity, self.max_abstract_edges_per_node = edge_capacity, max_abstract_edges_per_node
+        self.is_compiled = compile
+        self.last_uncovered_share = self.last_dropped_edges = None
+        self._faults = DelayedFaults()
         widths = (hidden_dim, hidden_dim)
         self.encode_node = nn.ModuleDict({name: MLP(feature_dim, widths) for name in ("previous", "current")})
         edge_types = ("previous_to_abstract", "current_to_abstract", "abstract_to_abstract", "abstract_to_current")
@@ -111,19 +141,75 @@ class HierarchicalGNNDynamics(AbstractDynamics):
 
         Raises:
             NonFiniteError: when a valid particle is not finite.
+            ConfigError: when edges did not fit into ``edge_capacity`` in an earlier call.
         """
+        return self.advance(previous, current, keys, rollout_step, self.num_abstract_nodes), memory
+
+    def advance(
+        self, previous: Particles, current: Particles, keys: RandomKeys, rollout_step: int, num_abstract_nodes: int
+    ) -> Particles:
+        """Take one step with another number of abstract nodes than the configured one; the weights allow any.
+
+        Raises:
+            NonFiniteError: when a valid particle is not finite.
+            ConfigError: when edges did not fit into ``edge_capacity`` in an earlier call.
+        """
+        if num_abstract_nodes < 1:
+            raise ValueError(f"num_abstract_nodes must be at least 1, got {num_abstract_nodes}.")
+        generators = keys.generators(f"abstract/{rollout_step}")
+        if self.edge_capacity is not None and current.num_particles:
+            return self._static_advance(previous, current, generators, num_abstract_nodes)
         graph = build_graph(
             previous,
             current,
-            keys.generators(f"abstract/{rollout_step}"),
-            num_abstract_nodes=self.num_abstract_nodes,
+            generators,
+            num_abstract_nodes=num_abstract_nodes,
             max_abstract_neighbors=self.max_abstract_neighbors,
             r_s=self.r_s,
             r_a_s=self.r_a_s,
             backend=self.neighbors_backend,
+            max_abstract_edges_per_node=self.max_abstract_edges_per_node,
         )
-        num_valid = current.mask.sum().clamp(min=1)
-        self.last_uncovered_share = (current.mask & ~graph.is_covered).sum() / num_valid
+        self.last_uncovered_share = _uncovered_share(current, graph)
+        positions, features = self._following(previous, current, graph)
+        return replace(current, positions=positions, features=features)
+
+    def _static_advance(
+        self, previous: Particles, current: Particles, generators: list[torch.Generator], num_abstract_nodes: int
+    ) -> Particles:
+        self._faults.raise_if_known()
+        priorities = draw_priorities(generators, current.num_particles)
+        device = current.positions.device
+        if device.type == "cuda":
+            priorities = priorities.pin_memory().to(device, non_blocking=True)
+        step = compiled_step(device.type) if self.is_compiled else static_step
+        positions, features, uncovered, dropped, non_finite = step(
+            self,
+            num_abstract_nodes,
+            priorities,
+            (previous.positions, previous.features, previous.mask),
+            (current.positions, current.features, current.mask),
+        )
+        if self.is_compiled and device.type == "cuda":
+            # A CUDA graph writes its next results over these.
+            positions, features, uncovered = positions.clone(), features.clone(), uncovered.clone()
+        self.last_uncovered_share, self.last_dropped_edges = uncovered, dropped.clone()
+        self._faults.watch(dropped, non_finite, self.edge_capacity or 0)
+        return replace(current, positions=positions, features=features)
+
+    def check_faults(self) -> None:
+        """Wait for the device, and raise if the last static step dropped edges or met what is not finite.
+
+        Raises:
+            NonFiniteError: when a valid particle is not finite.
+            ConfigError: when edges did not fit into ``edge_capacity``.
+        """
+        self._faults.raise_if_any()
+
+    def _following(
+        self, previous: Particles, current: Particles, graph: HierarchicalGraph
+    ) -> tuple[Float[Tensor, "batch particle 3"], Float[Tensor, "batch particle feature"]]:
+        """Return the next positions and features."""
         nodes = self._message_passing(previous, current, graph)
         delta_location = self.decode_location(nodes).view(*current.positions.shape)
         delta_feature = self.decode_feature(nodes).view(*current.features.shape)
@@ -133,56 +219,97 @@ class HierarchicalGNNDynamics(AbstractDynamics):
             positions = torch.where(valid, current.positions + delta_location, current.positions)
             features = current.features + delta_feature.to(current.features.dtype)
             features = torch.where(valid, features, current.features)
-        return replace(current, positions=positions, features=features), memory
+        return positions, features
 
     def _message_passing(
         self, previous: Particles, current: Particles, graph: HierarchicalGraph
     ) -> Float[Tensor, "node feature"]:
         """Return the updated latents of all current particles: Algorithm 1 from the encoders to the decoders."""
-        positions = {"previous": previous.positions.flatten(0, 1), "current": current.positions.flatten(0, 1)}
+        positions = {"previous": _usable(previous, "positions"), "current": _usable(current, "positions")}
         positions["abstract"] = positions["current"].index_select(0, graph.abstract_index)
         edge_sets: dict[str, EdgeSet] = {name: getattr(graph, name) for name in self.encode_edge}
 
         # Encode particle nodes and edges.
         nodes = {
-            "previous": self.encode_node["previous"](_usable(previous)),
-            "current": self.encode_node["current"](_usable(current)),
+            "previous": self.encode_node["previous"](_usable(previous, "features")),
+            "current": self.encode_node["current"](_usable(current, "features")),
         }
         edges = {}
         for name, edge_set in edge_sets.items():
             sender_type, receiver_type = name.split("_to_")
-            relative = positions[sender_type].index_select(0, edge_set.senders)
-            relative = relative - positions[receiver_type].index_select(0, edge_set.receivers)
+            relative = carried(positions[sender_type], edge_set.senders, -positions[receiver_type], edge_set.receivers)
             edges[name] = self.encode_edge[name](relative)
 
         # Update particle -> abstract edges, then abstract nodes.
         messages = []
         for sender_type in ("previous", "current"):
             name = f"{sender_type}_to_abstract"
-            edge_set = edge_sets[name]
-            updated = self.update_edge[name](
-                edges[name], nodes[sender_type], None, edge_set.senders, edge_set.receivers
-            )
-            messages.append(summed_at_receivers(updated, edge_set.receiver_offsets))
+            updated = self.update_edge[name](edges.pop(name), nodes[sender_type], None, edge_sets[name])
+            messages.append(edge_sets[name].receivers.summed(updated))
         abstract = self.update_node["abstract_first"](None, messages[0] + messages[1])
 
         # Perform message passing among abstract nodes.
-        edge_set, among = edge_sets["abstract_to_abstract"], edges["abstract_to_abstract"]
+        edge_set, among = edge_sets["abstract_to_abstract"], edges.pop("abstract_to_abstract")
         for update_edge, update_node in zip(
             self.update_edge["abstract_to_abstract"], self.update_node["abstract"], strict=True
         ):
-            among = update_edge(among, abstract, abstract, edge_set.senders, edge_set.receivers)
-            abstract = update_node(abstract, summed_at_receivers(among, edge_set.receiver_offsets))
+            among = update_edge(among, abstract, abstract, edge_set)
+            abstract = update_node(abstract, edge_set.receivers.summed(among))
 
         # Update abstract -> current edges, then current particles.
         edge_set = edge_sets["abstract_to_current"]
         updated = self.update_edge["abstract_to_current"](
-            edges["abstract_to_current"], abstract, nodes["current"], edge_set.senders, edge_set.receivers
+            edges.pop("abstract_to_current"), abstract, nodes["current"], edge_set
         )
-        message = summed_at_receivers(updated, edge_set.receiver_offsets)
-        return self.update_node["current"](nodes["current"], message)
+        return self.update_node["current"](nodes["current"], edge_set.receivers.summed(updated))
 
 
-def _usable(particles: Particles) -> Float[Tensor, "node feature"]:
-    """Return flat features with zeros for padding, whose numbers must not reach anything, not even as NaN times 0."""
-    return torch.where(particles.mask[..., None], particles.features, 0.0).flatten(0, 1)
+def _usable(particles: Particles, name: str) -> Float[Tensor, "node any"]:
+    """Return one field, flat, with zeros for padding, whose numbers must not get anywhere, not even as NaN times 0."""
+    return torch.where(particles.mask[..., None], getattr(particles, name), 0.0).flatten(0, 1)
+
+
+def _uncovered_share(current: Particles, graph: HierarchicalGraph) -> Float[Tensor, ""]:
+    return (current.mask & ~graph.is_covered).sum() / current.mask.sum().clamp(min=1)
+
+
+def static_step(
+    dynamics: HierarchicalGNNDynamics,
+    num_abstract_nodes: int,
+    priorities: Float64[Tensor, "batch particle"],
+    previous_tensors: tuple[Tensor, Tensor, Tensor],
+    current_tensors: tuple[Tensor, Tensor, Tensor],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Take one step with fixed shapes; positions, features and masks in, because tensors are what compilers know.
+
+    Returns positions, features, the share of uncovered particles, the edges dropped and the particles not finite.
+    """
+    previous, current = Particles(*previous_tensors), Particles(*current_tensors)
+    built = build_static_graph(
+        previous,
+        current,
+        priorities,
+        num_abstract_nodes=num_abstract_nodes,
+        max_abstract_neighbors=dynamics.max_abstract_neighbors,
+        r_s=dynamics.r_s,
+        r_a_s=dynamics.r_a_s,
+        edge_capacity=dynamics.edge_capacity,
+        max_abstract_edges_per_node=dynamics.max_abstract_edges_per_node,
+    )
+    positions, features = dynamics._following(previous, current, built.graph)
+    return positions, features, _uncovered_share(current, built.graph), built.dropped_edges, built.non_finite
+
+
+@functools.cache
+def compiled_step(device_type: str) -> Callable[..., tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+    """Return ``static_step`` for torch.compile; it is compiled again for every new size, so keep these few.
+
+    Raises:
+        ConfigError: when the compiler that torch.compile needs is not installed.
+    """
+    if device_type == "cpu" and not any(map(shutil.which, (os.environ.get("CXX", "g++"), "g++", "clang++"))):
+        raise ConfigError("dynamics.compile=true needs a C++ compiler on a CPU.\nInstall g++, or set compile to false.")
+    if device_type == "cuda" and importlib.util.find_spec("triton") is None:
+        raise ConfigError("dynamics.compile=true needs triton on a GPU.\npip install triton, or set compile to false.")
+    mode = "reduce-overhead" if device_type == "cuda" else "default"
+    return torch.compile(static_step, fullgraph=True, dynamic=False, mode=mode)

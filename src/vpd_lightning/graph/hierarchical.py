@@ -3,42 +3,58 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from vpd_lightning.graph.incidence import Incidence
 from vpd_lightning.graph.neighbors import PointIndex
 from vpd_lightning.types import Particles
 
 
 @dataclass(frozen=True)
 class EdgeSet:
-    """Directed edges of one type, sorted by receiver; node indices are flat, counted over the whole batch."""
+    """Directed edges of one type, by their two ends; nodes are counted over the whole batch."""
 
-    senders: Int64[Tensor, " edge"]
-    receivers: Int64[Tensor, " edge"]
-    receiver_offsets: Int64[Tensor, " node_plus_one"]
+    senders: Incidence
+    receivers: Incidence
 
-    @classmethod
-    def of(cls, senders: Int64[Tensor, " edge"], receivers: Int64[Tensor, " edge"], num_receivers: int) -> "EdgeSet":
-        """Sort edges by receiver (edges of one receiver keep their order) and find where each receiver starts."""
-        receivers, order = receivers.sort(stable=True)
-        bounds = torch.arange(num_receivers + 1, device=receivers.device)
-        return cls(senders.index_select(0, order), receivers, torch.searchsorted(receivers, bounds))
+    def reversed(self) -> "EdgeSet":
+        """Return the same edges the other way round."""
+        return EdgeSet(self.receivers, self.senders)
+
+    def pairs(self) -> tuple[Int64[Tensor, " edge"], Int64[Tensor, " edge"]]:
+        """Return sender and receiver of every edge that is none of the padding."""
+        is_edge = (self.senders.index < self.senders.num_nodes) & (self.receivers.index < self.receivers.num_nodes)
+        return self.senders.index[is_edge], self.receivers.index[is_edge]
 
 
 @dataclass(frozen=True)
 class HierarchicalGraph:
     """Edge sets between particles and abstract nodes; abstract node j sits on current particle ``abstract_index[j]``.
 
-    ``is_covered`` tells which current particles have an abstract node within reach.
+    The edges at particles are a table, a fixed number for each particle with padding where there is no abstract node
+    in reach; both directions between current particles and abstract nodes share one. The edges among abstract nodes
+    are sorted by receiver. ``is_covered`` tells which current particles have an abstract node within reach.
     """
 
     abstract_index: Int64[Tensor, " abstract_node"]
     previous_to_abstract: EdgeSet
     current_to_abstract: EdgeSet
     abstract_to_abstract: EdgeSet
-    abstract_to_current: EdgeSet
     is_covered: Bool[Tensor, "batch particle"]
+
+    @property
+    def abstract_to_current(self) -> EdgeSet:
+        return self.current_to_abstract.reversed()
+
+
+def draw_priorities(generators: list[torch.Generator], num_particles: int) -> Float64[Tensor, "batch particle"]:
+    """Draw what decides who becomes an abstract node: the valid particles with the smallest numbers do.
+
+    The i-th valid particle of a member gets the i-th number, so that padding changes no choice.
+    """
+    draws = [torch.rand(num_particles, generator=generator, dtype=torch.float64) for generator in generators]
+    return torch.stack(draws) if draws else torch.zeros(0, num_particles, dtype=torch.float64)
 
 
 @torch.no_grad()
@@ -52,13 +68,15 @@ def build_graph(
     r_s: float,
     r_a_s: float,
     backend: str,
+    max_abstract_edges_per_node: int | None = None,
 ) -> HierarchicalGraph:
     """Build the graph of each batch member and put them side by side (paper section 3.2, Graph construction).
 
     ``num_abstract_nodes`` of the valid current particles (all, where there are fewer) are chosen uniformly without
     replacement. Each valid particle of both times is tied to its nearest abstract nodes, at most
     ``max_abstract_neighbors`` and within ``r_s`` metres; current particles get the same ties backwards. Abstract
-    nodes within ``r_a_s`` metres of each other are tied in both directions, all of them, without self loops.
+    nodes within ``r_a_s`` metres of each other are tied in both directions, all of them, without self loops; with
+    ``max_abstract_edges_per_node`` each receives from that many nearest ones only.
     Indices into particles count ``batch * particle``; padding has no edges.
 
     Raises:
@@ -66,46 +84,70 @@ def build_graph(
         ValueError: when there is not one generator per batch member.
     """
     batch_size, num_current = current.mask.shape
-    num_previous = previous.mask.shape[1]
     if len(generators) != batch_size:
         raise ValueError(f"One generator per batch member is needed: got {len(generators)} for {batch_size}.")
-    device = current.positions.device
-    covered = torch.zeros_like(current.mask)
-    parts: dict[str, list[tuple[Tensor, Tensor]]] = {"previous": [], "current": [], "abstract": []}
-    chosen, num_abstract = [], 0
-    for member, generator in enumerate(generators):
-        valid_current = current.mask[member].nonzero()[:, 0]
-        order = torch.randperm(len(valid_current), generator=generator)[:num_abstract_nodes]
-        members_choice = valid_current.index_select(0, order.to(device))
+    # -1 stands for "no abstract node" until their number is known.
+    ties = {
+        name: torch.full((*particles.mask.shape, max_abstract_neighbors), -1, device=particles.mask.device)
+        for name, particles in (("previous", previous), ("current", current))
+    }
+    among: list[tuple[Tensor, Tensor]] = []
+    chosen: list[Tensor] = []
+    num_abstract = 0
+    priorities = draw_priorities(generators, num_current)
+    for member in range(batch_size):
+        valid = current.mask[member].nonzero()[:, 0]
+        order = priorities[member, : len(valid)].argsort(stable=True)[:num_abstract_nodes]
+        members_choice = valid.index_select(0, order.to(valid.device))
         centers = current.positions[member].index_select(0, members_choice)
         index = PointIndex(centers, backend, is_graph=True)
-        valid_previous = previous.mask[member].nonzero()[:, 0]
-        for name, particles, valid, size in (
-            ("previous", previous, valid_previous, num_previous),
-            ("current", current, valid_current, num_current),
-        ):
-            positions = particles.positions[member].index_select(0, valid)
-            near = index.knn(positions, max_abstract_neighbors, r_s)
-            particle = (valid + member * size)[:, None].expand_as(near.index)[near.mask]
-            parts[name].append((particle, near.index[near.mask] + num_abstract))
-            if name == "current":
-                covered[member, valid] = near.mask.any(dim=1)
-        senders, receivers = PointIndex(centers, backend, is_radius=True, is_graph=True).radius(centers, r_a_s)
-        is_other = senders != receivers
-        parts["abstract"].append((senders[is_other] + num_abstract, receivers[is_other] + num_abstract))
+        for name, particles in (("previous", previous), ("current", current)):
+            rows = particles.mask[member].nonzero()[:, 0]
+            near = index.knn(particles.positions[member].index_select(0, rows), max_abstract_neighbors, r_s)
+            ties[name][member, rows] = torch.where(near.mask, near.index + num_abstract, -1)
+        if max_abstract_edges_per_node is None:
+            senders, receivers = PointIndex(centers, backend, is_radius=True, is_graph=True).radius(centers, r_a_s)
+            is_other = senders != receivers
+            among.append((senders[is_other] + num_abstract, receivers[is_other] + num_abstract))
+        else:
+            near = index.knn(centers, max_abstract_edges_per_node + 1, r_a_s)
+            mask = without_self(near.index, near.mask)
+            among.append((near.index + num_abstract, mask))
         chosen.append(members_choice + member * num_current)
         num_abstract += len(members_choice)
 
-    def joined(name: str) -> tuple[Tensor, Tensor]:
-        return tuple(torch.cat(column) for column in zip(*parts[name], strict=True))  # type: ignore[return-value]
-
-    previous_particle, previous_abstract = joined("previous")
-    current_particle, current_abstract = joined("current")
+    joined = tuple(torch.cat(column) for column in zip(*among, strict=True))
     return HierarchicalGraph(
         abstract_index=torch.cat(chosen),
-        previous_to_abstract=EdgeSet.of(previous_particle, previous_abstract, num_abstract),
-        current_to_abstract=EdgeSet.of(current_particle, current_abstract, num_abstract),
-        abstract_to_abstract=EdgeSet.of(*joined("abstract"), num_abstract),
-        abstract_to_current=EdgeSet.of(current_abstract, current_particle, batch_size * num_current),
-        is_covered=covered,
+        previous_to_abstract=ties_to_abstract(ties["previous"].flatten(0, 1), num_abstract),
+        current_to_abstract=ties_to_abstract(ties["current"].flatten(0, 1), num_abstract),
+        abstract_to_abstract=(
+            EdgeSet(Incidence.of(joined[0], num_abstract), Incidence.of(joined[1], num_abstract, is_sorted=True))
+            if max_abstract_edges_per_node is None
+            else edges_from_table(*joined)
+        ),
+        is_covered=(ties["current"] >= 0).any(dim=2),
     )
+
+
+def ties_to_abstract(table: Int64[Tensor, "particle neighbor"], num_abstract: int) -> EdgeSet:
+    """Return the edges from particles to the abstract nodes of a table that holds -1 where there is none."""
+    mask = table >= 0
+    receivers = torch.where(mask, table, num_abstract).flatten()
+    return EdgeSet(Incidence.of_table(mask), Incidence.of(receivers, num_abstract))
+
+
+def edges_from_table(index: Int64[Tensor, "node neighbor"], mask: Bool[Tensor, "node neighbor"]) -> EdgeSet:
+    """Return the edges to each node from its row of a table."""
+    senders = torch.where(mask, index, len(index)).flatten()
+    return EdgeSet(Incidence.of(senders, len(index)), Incidence.of_table(mask))
+
+
+def without_self(
+    index: Int64[Tensor, "*batch node neighbor"], mask: Bool[Tensor, "*batch node neighbor"]
+) -> Bool[Tensor, "*batch node neighbor"]:
+    """Mask each point out of its own list of neighbours, or the farthest where duplicates pushed it out."""
+    is_self = index == torch.arange(index.shape[-2], device=index.device)[:, None]
+    is_self = is_self & mask
+    is_last = torch.arange(index.shape[-1], device=index.device) == index.shape[-1] - 1
+    return mask & ~is_self & ~(is_last & ~is_self.any(dim=-1, keepdim=True))
