@@ -72,6 +72,9 @@ DEPARTURES = {
     "HierarchicalGNNDynamics": {
         "test_order_of_particles_does_not_matter": "abstract nodes are drawn among the slots of the current particles"
     },
+    "SleepingDynamics": {
+        "test_order_of_particles_does_not_matter": "it wraps the graph network, whose abstract nodes are drawn so"
+    },
 }
 NEEDS_OBSERVATIONS = {"InertialDynamics"}
 

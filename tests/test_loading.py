@@ -1,5 +1,8 @@
 """Loading a trained model: only whole checkpoints of ours, with plain configurations, on devices that are there."""
 
+import inspect
+import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -7,6 +10,8 @@ import torch
 
 import vpd_lightning
 from tests.evaluation.untrained_model import write_untrained
+from vpd_lightning.config.migrations import ADDED_SETTINGS
+from vpd_lightning.dynamics.sleeping import SleepingDynamics
 from vpd_lightning.errors import CheckpointError, ConfigError
 from vpd_lightning.loading import find_device, load_model
 from vpd_lightning.training.checkpoint_io import load_checkpoint, write_checkpoint
@@ -63,3 +68,56 @@ def test_what_is_no_checkpoint_is_refused(tmp_path: Path, content: bytes) -> Non
 def test_devices_that_are_not_there_are_refused(device: str) -> None:
     with pytest.raises(ConfigError, match="device=cpu"):
         find_device(device)
+
+
+def test_settings_that_came_later_mean_what_older_checkpoints_did(tmp_path: Path) -> None:
+    path = write_untrained(tmp_path / "run", tmp_path)
+    content = load_checkpoint(path)
+    renderer = content["hyper_parameters"]["renderer"]
+    added = ADDED_SETTINGS[renderer["_target_"]]
+    for name in added:
+        del renderer[name]
+    write_checkpoint(content, path)
+    loaded = load_model(path).config["renderer"]
+    assert {name: loaded[name] for name in added} == added
+
+
+def test_every_added_setting_is_an_argument_of_its_class() -> None:
+    for target, settings in ADDED_SETTINGS.items():
+        module, name = target.rsplit(".", 1)
+        parameters = inspect.signature(getattr(import_module(module), name)).parameters
+        assert set(settings) <= set(parameters), target
+
+
+def test_settings_of_a_trained_model_can_be_changed(tmp_path: Path) -> None:
+    path = write_untrained(tmp_path / "run", tmp_path)
+    before = load_model(path)
+    after = load_model(path, change={"renderer": {"ray_chunk_size": 7}})
+    assert after.simulator.renderer.ray_chunk_size == 7 != before.simulator.renderer.ray_chunk_size
+    assert after.config["renderer"] == {**before.config["renderer"], "ray_chunk_size": 7}
+    for name, value in after.simulator.state_dict().items():
+        assert torch.equal(value, before.simulator.state_dict()[name])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"rendrer": {"near": 1.0}}, "Did you mean change.renderer?"),
+        ({"renderer": {"neer": 1.0}}, "Did you mean change.renderer.near?"),
+        ({"renderer": 3}, "change.renderer=3 is no section"),
+        ({"renderer": {"near": 100.0}}, "near and far"),
+        ({"renderer": {"net_width": 8}}, "asks for other weights"),
+    ],
+)
+def test_changes_that_cannot_be_are_refused(tmp_path: Path, change: dict, said: str) -> None:
+    path = write_untrained(tmp_path / "run", tmp_path)
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        load_model(path, change=change)
+
+
+def test_a_model_trained_awake_can_sleep(tmp_path: Path) -> None:
+    path = write_untrained(tmp_path / "run", tmp_path)
+    model = load_model(path, change={"dynamics": {"rest_steps": 5}}, sleeping=True)
+    assert isinstance(model.simulator.dynamics, SleepingDynamics) and model.simulator.dynamics.rest_steps == 5
+    for name, value in load_model(path).simulator.state_dict().items():
+        assert torch.equal(value, model.simulator.state_dict()[name])

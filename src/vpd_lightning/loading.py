@@ -1,5 +1,6 @@
 """From a checkpoint to a simulator that predicts: ``vpd_lightning.load``."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,10 +46,26 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Simulator:
     return load_model(path, device).simulator
 
 
-def load_model(path: str | Path, device: str | torch.device = "cpu") -> LoadedModel:
-    """Load a simulator together with its configuration; see ``load``."""
+def load_model(
+    path: str | Path,
+    device: str | torch.device = "cpu",
+    change: Mapping[str, Any] | None = None,
+    *,
+    sleeping: bool = False,
+) -> LoadedModel:
+    """Load a simulator together with its configuration; see ``load``.
+
+    ``change`` replaces settings of its configuration, for example ``{"renderer": {"early_stop": 1e-3}}``: what does not
+    touch the weights may differ from training. ``sleeping`` leaves what has come to rest out of rollouts (approximate,
+    see ``dynamics.sleeping``); it comes before ``change``, which may then set ``dynamics.rest_speed`` and the like.
+
+    Raises:
+        ConfigError: ``change`` names a section or a setting that the model does not have.
+    """
     # Imported here: importing the package must not need Hydra or Lightning.
     from vpd_lightning.config import build_simulator
+    from vpd_lightning.config.migrations import changed, upgraded
+    from vpd_lightning.config.sleeping import with_sleeping
     from vpd_lightning.training.checkpoint_io import load_checkpoint
     from vpd_lightning.training.checkpoints import find_resume
 
@@ -60,9 +77,16 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> LoadedMo
     config = content.get("hyper_parameters")
     if not isinstance(config, dict) or not isinstance(config.get("scene"), dict):
         raise CheckpointError(f"{path} does not say what model it holds (no hyper_parameters).\nUse one of vpd-train.")
+    config = upgraded(config)
+    if sleeping:
+        config = with_sleeping(config)
+    if change:
+        config = changed(config, change)
     try:
         simulator = build_simulator(config)
     except ConfigError as error:
+        if change:
+            raise
         raise CheckpointError(
             f"{path} describes a model that this version cannot build.\n{str(error).splitlines()[0]}"
         ) from error
@@ -73,6 +97,10 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> LoadedMo
         simulator.load_state_dict(weights)
     except RuntimeError as error:
         detail = " ".join(str(error).split())
+        if change:
+            raise ConfigError(
+                f"change={dict(change)} asks for other weights than {path} holds.\n{detail[:300]}"
+            ) from error
         raise CheckpointError(f"The weights in {path} do not fit the model it describes.\n{detail[:300]}") from error
     step = content.get("global_step", 0)
     return LoadedModel(simulator.to(target).eval(), config, path, step if isinstance(step, int) else 0)

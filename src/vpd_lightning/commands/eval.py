@@ -40,7 +40,7 @@ def _evaluate(config: Mapping[str, Any]) -> None:
     if config["num_videos"] < 0:
         raise ConfigError(f"num_videos={config['num_videos']} is out of range.\nAllowed: 0 or more.")
     set_threads(config["num_threads"])
-    model = load_model(config["ckpt"], config["device"])
+    model = load_model(config["ckpt"], config["device"], config["change"], sleeping=config["sleeping"])
     protocol = choose_protocol(config["protocol"], model.config.get("protocol"))
     manifest = load_manifest(data_folder(config["data"]["folder"], model.config))
     name = "evaluation" if protocol.split == "test" else f"evaluation_{protocol.split}"

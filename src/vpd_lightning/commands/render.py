@@ -37,7 +37,7 @@ def _render(config: Mapping[str, Any]) -> None:
 
     _check(config)
     set_threads(config["num_threads"])
-    model = load_model(config["ckpt"], config["device"])
+    model = load_model(config["ckpt"], config["device"], config["change"], sleeping=config["sleeping"])
     manifest = load_manifest(data_folder(config["data"]["folder"], model.config))
     path = _choose_trajectory(manifest.split(config["split"]), config)
     start, num_steps = config["start_frame"], config["num_steps"]

@@ -18,10 +18,17 @@ from vpd_lightning.config.explaining import explain, explain_missing_value, refu
 from vpd_lightning.config.paths import config_folder
 from vpd_lightning.config.plugins import load_plugins
 from vpd_lightning.config.run_folders import register_resolvers
-from vpd_lightning.config.schema import EvalConfig, RenderConfig, TrainConfig, check_scene, check_training
+from vpd_lightning.config.schema import (
+    BenchConfig,
+    EvalConfig,
+    RenderConfig,
+    TrainConfig,
+    check_scene,
+    check_training,
+)
 from vpd_lightning.errors import ConfigError
 
-SCHEMAS: dict[str, type] = {"train": TrainConfig, "eval": EvalConfig, "render": RenderConfig}
+SCHEMAS: dict[str, type] = {"train": TrainConfig, "eval": EvalConfig, "render": RenderConfig, "bench": BenchConfig}
 
 
 def prepare() -> None:

@@ -106,6 +106,8 @@ class EvalConfig:
     """Root of ``vpd-eval``."""
 
     ckpt: str = MISSING
+    change: Any = None
+    sleeping: bool = MISSING
     data: DataChoice = MISSING
     out: str | None = None
     device: str = MISSING
@@ -120,6 +122,8 @@ class RenderConfig:
     """Root of ``vpd-render``."""
 
     ckpt: str = MISSING
+    change: Any = None
+    sleeping: bool = MISSING
     data: DataChoice = MISSING
     split: str = MISSING
     trajectory: int = MISSING
@@ -132,6 +136,21 @@ class RenderConfig:
     out: str | None = None
     save_particles: list[str] = MISSING
     device: str = MISSING
+    num_threads: int | None = None
+    debug: bool = MISSING
+
+
+@dataclass
+class BenchConfig:
+    """Root of ``vpd-bench``; ``suite`` is one name or several."""
+
+    suite: Any = MISSING
+    device: str = MISSING
+    out: str | None = None
+    repeats: int = MISSING
+    quick: bool = MISSING
+    ckpt: list[str] = MISSING
+    data: DataChoice = MISSING
     num_threads: int | None = None
     debug: bool = MISSING
 

@@ -207,5 +207,8 @@ def _assert_plain(memory: Any) -> None:
     assert is_dataclass(memory), f"memory must be None or a dataclass of tensors, got {type(memory).__name__}"
     for item in fields(memory):
         value = getattr(memory, item.name)
+        if is_dataclass(value):  # a dynamics that wraps another one keeps the memory of that one, too
+            _assert_plain(value)
+            continue
         is_plain = value is None or isinstance(value, Tensor | bool | int | float | str | Particles)
         assert is_plain, f"memory.{item.name} is a {type(value).__name__}; a memory holds tensors and plain numbers"
