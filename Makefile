@@ -89,9 +89,14 @@ cluster: $(STAMP) ## Build and install torch-cluster (needs a C++ compiler; 10 t
 	$(BIN)/python -m pip install -c constraints.txt setuptools wheel
 	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation torch-cluster==1.6.3
 
-bench: $(STAMP) ## Time one training step and one rendered frame against the plain path; writes benchmarks/results
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_step
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.render_frame
+# Trained models for the suites accuracy and rollout: those under runs/bench, where there are any.
+BENCH_MODELS = $(wildcard runs/bench/*/checkpoints/last.ckpt)
+comma := ,
+empty :=
+
+bench: $(STAMP) ## Measure all suites on the CPU, one thread, in under 15 minutes; writes benchmarks/results and its page
+	OMP_NUM_THREADS=1 $(BIN)/vpd-bench suite=all device=cpu "ckpt=[$(subst $(empty) $(empty),$(comma),$(strip $(BENCH_MODELS)))]"
+	$(BIN)/python -m benchmarks.page
 
 paper-step: $(STAMP) ## Take one training step at the paper's size, one clip on the CPU: finite gradients, time, peak memory
 	$(BIN)/python -m benchmarks.paper_size_step --json benchmarks/results/paper_size_step_cpu.json

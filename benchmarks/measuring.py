@@ -1,34 +1,46 @@
-"""Stopwatch, machine description and result files of the benchmarks."""
+"""Rows, clocks and interleaved repeats: everything that a suite needs to measure."""
 
-import json
 import platform
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
 
-RESULTS = Path(__file__).parent / "results"
-PACKAGES = ("torch", "numpy", "scipy", "lightning", "torch-geometric")
+SIZES = ("full", "quick", "tiny")
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to measure. ``size`` is full, quick or tiny (tests); ``checkpoints`` are trained models for two suites."""
+
+    device: torch.device
+    size: str
+    repeats: int
+    checkpoints: Sequence[Path] = ()
+    data: Path | None = None
+
+    def pick(self, full: Any, quick: Any, tiny: Any) -> Any:
+        """Return the value that belongs to the size."""
+        return {"full": full, "quick": quick, "tiny": tiny}[self.size]
 
 
 @dataclass(frozen=True)
 class Row:
     """One line of a result. ``ratio`` is baseline_seconds / seconds: how many times faster than the baseline.
 
-    ``error`` compares the result with the baseline's where both compute the same; what it means stands in ``note``.
-    ``peak_bytes`` is device memory, on a GPU only.
+    ``error`` and ``psnr`` (dB to the true picture) are what ``note`` says. ``peak_bytes`` is what the work needs beyond
+    what was there before: resident memory of a process of its own on a CPU, allocated memory on a GPU.
     """
 
     name: str
     baseline: str
-    seconds: float
+    seconds: float | None
     baseline_seconds: float | None
     ratio: float | None
     error: float | None
@@ -37,20 +49,29 @@ class Row:
     note: str = ""
 
 
+@dataclass(frozen=True)
+class Result:
+    """What a suite found: rows, and named numbers that belong to the suite as a whole (rates, floors, exponents)."""
+
+    rows: Sequence[Row]
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
 def row(
     name: str,
-    seconds: Sequence[float],
+    seconds: Sequence[float] = (),
     baseline: str = "",
-    baseline_seconds: Sequence[float] | None = None,
+    baseline_seconds: Sequence[float] = (),
     error: float | None = None,
+    psnr: float | None = None,
     peak_bytes: int | None = None,
     note: str = "",
 ) -> Row:
     """Make a row of the medians of repeated measurements."""
-    here = median(seconds)
+    here = median(seconds) if seconds else None
     there = median(baseline_seconds) if baseline_seconds else None
-    ratio = there / here if there is not None and here > 0 else None
-    return Row(name, baseline, here, there, ratio, error, None, peak_bytes, note)
+    ratio = there / here if here and there is not None else None
+    return Row(name, baseline, here, there, ratio, error, psnr, peak_bytes, note)
 
 
 def seconds_now(device: torch.device) -> float:
@@ -60,6 +81,33 @@ def seconds_now(device: torch.device) -> float:
     elif torch.get_num_threads() == 1:
         return time.process_time()
     return time.perf_counter()
+
+
+def interleaved(
+    functions: Mapping[str, Callable[[], Any]], repeats: int, device: torch.device, warm_up: bool = True
+) -> dict[str, list[float]]:
+    """Time functions in turns, so that what slows the machine for a while slows all of them; seconds per function."""
+    seconds: dict[str, list[float]] = {name: [] for name in functions}
+    for repeat in range(repeats + warm_up):
+        for name, function in functions.items():
+            start = seconds_now(device)
+            function()
+            taken = seconds_now(device) - start
+            if repeat or not warm_up:
+                seconds[name].append(taken)
+    return seconds
+
+
+def device_peak(function: Callable[[], Any], device: torch.device) -> int | None:
+    """Return the bytes that a call allocates on a GPU beyond what is there; None on a CPU."""
+    if device.type != "cuda":
+        return None
+    torch.cuda.synchronize(device)
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    function()
+    torch.cuda.synchronize(device)
+    return torch.cuda.max_memory_allocated(device) - before
 
 
 class Stopwatch:
@@ -119,6 +167,17 @@ def replaced(owner: Any, attribute: str, value: Any) -> Iterator[None]:
             delattr(owner, attribute)
 
 
+@contextmanager
+def num_threads(count: int) -> Iterator[None]:
+    """Let PyTorch compute on this many threads for a while."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def device_name(device: torch.device) -> str:
     """Name the processor or the GPU, with the number of threads where it matters."""
     if device.type == "cuda":
@@ -132,28 +191,16 @@ def device_name(device: torch.device) -> str:
     return f"{model}, {torch.get_num_threads()} thread(s)"
 
 
-def write(suite: str, device: torch.device, rows: Sequence[Row]) -> Path:
-    """Write ``results/<suite>_<device>.json``, print the table, and return the path."""
-    content = {
-        "suite": suite,
-        "device": device_name(device),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
-        "rows": [asdict(item) for item in rows],
-    }
-    print(f"\n{content['device']}\n\n{table(rows)}\n")
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{suite}_{device.type}.json"
-    path.write_text(json.dumps(content, indent=1) + "\n")
-    print(path)
-    return path
+def gemm_rate(device: torch.device, dtype: torch.dtype = torch.float32, size: int = 1024) -> float:
+    """Return the operations per second of a big matrix product, the best of several: what a network can hope for."""
+    left, right = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
+    seconds = interleaved({"product": lambda: left @ right}, 7, device)["product"]
+    return 2 * size**3 / max(min(seconds), 1e-9)
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Return the rows as a Markdown table."""
-    lines = ["| what | ms | baseline ms | ratio | error | baseline |", "|---|---:|---:|---:|---:|---|"]
-    for item in rows:
-        there = "" if item.baseline_seconds is None else f"{1000 * item.baseline_seconds:.1f}"
-        ratio = "" if item.ratio is None else f"{item.ratio:.2f}x"
-        error = "" if item.error is None else f"{item.error:.1e}"
-        lines.append(f"| {item.name} | {1000 * item.seconds:.1f} | {there} | {ratio} | {error} | {item.baseline} |")
-    return "\n".join(lines)
+def copy_rate(device: torch.device, num_bytes: int = 1 << 27) -> float:
+    """Return the bytes per second, read plus written, of a copy that no cache holds."""
+    source = torch.zeros(num_bytes // 4, device=device)
+    target = torch.empty_like(source)
+    seconds = interleaved({"copy": lambda: target.copy_(source)}, 5, device)["copy"]
+    return 2 * num_bytes / max(min(seconds), 1e-9)

@@ -10,76 +10,23 @@ must stay below 16 GiB; the exit code is 1 otherwise. Overrides are those of vpd
 
 import argparse
 import json
-import math
 import resource
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.worlds import video_batch
 from vpd_lightning.config import build, build_list, build_simulator, compose
-from vpd_lightning.geometry.cameras import pixel_rays
 from vpd_lightning.losses.base import AbstractLoss
-from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.training.optimization import AbstractOptimization
-from vpd_lightning.types import Cameras, Rays, RGBDFrames, VideoBatch
 
 SIZE = 128
 NUM_STEPS, RAYS_PER_STEP = 6, 256
 LIMIT_BYTES = 16 * 2**30
-
-
-def _look_down(distance: float) -> Cameras:
-    """A camera 45 degrees above the ground, looking at the origin; its picture lies within the workspace of +-1 m."""
-    down, side = math.sqrt(0.5), torch.tensor([0.0, 1.0, 0.0])
-    forward = torch.tensor([-down, 0.0, -down])
-    pose = torch.eye(4)
-    pose[:3, :3] = torch.stack([side, torch.linalg.cross(forward, side), forward], dim=1)
-    pose[:3, 3] = -distance * forward
-    focal = 2.2 * SIZE
-    intrinsics = torch.tensor([[focal, 0.0, SIZE / 2], [0.0, focal, SIZE / 2], [0.0, 0.0, 1.0]])
-    return Cameras(intrinsics, pose, SIZE, SIZE)
-
-
-def _picture(cameras: Cameras, center: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Ray cast a chequered floor and a ball: RGB in [0, 1] and z-depth."""
-    rays = pixel_rays(cameras)
-    floor = -rays.origins[..., 2] / rays.directions[..., 2]
-    offset = rays.origins - center
-    half = (offset * rays.directions).sum(-1)
-    root = half.square() - offset.square().sum(-1) + 0.2**2
-    ball = torch.where(root > 0, -half - root.clamp(min=0).sqrt(), math.inf)
-    distance = torch.minimum(floor, ball)
-    points = rays.origins + distance[..., None] * rays.directions
-    chequered = ((points[..., :2] * 5).floor().sum(-1) % 2)[..., None].expand(*floor.shape, 3) * 0.5 + 0.25
-    rgb = torch.where((ball < floor)[..., None], (points - center) * 2.5 + 0.5, chequered)
-    return rgb, distance * (rays.directions * cameras.cam_to_world[:3, 2]).sum(-1)
-
-
-def synthetic_batch(seed: int = 0) -> VideoBatch:
-    """One clip of a rising ball: two context frames from one view, random pixels of the six that follow."""
-    cameras, generator = _look_down(2.2), np.random.default_rng(seed)
-    pictures = [_picture(cameras, torch.tensor([0.0, 0.0, 0.2 + 0.03 * t])) for t in range(2 + NUM_STEPS)]
-    views = Cameras(cameras.intrinsics.expand(1, 2, 1, 3, 3), cameras.cam_to_world.expand(1, 2, 1, 4, 4), SIZE, SIZE)
-    context = RGBDFrames(
-        torch.stack([rgb for rgb, _ in pictures[:2]])[None, :, None],
-        torch.stack([depth for _, depth in pictures[:2]])[None, :, None],
-        views,
-    )
-    rays = pixel_rays(cameras)
-    chosen = torch.from_numpy(generator.integers(0, SIZE * SIZE, (NUM_STEPS, RAYS_PER_STEP)))
-    targets = torch.stack([rgb.reshape(-1, 3)[index] for (rgb, _), index in zip(pictures[2:], chosen, strict=True)])
-    return VideoBatch(
-        context,
-        Rays(rays.origins.reshape(-1, 3)[chosen][None], rays.directions.reshape(-1, 3)[chosen][None]),
-        targets[None],
-        RandomKeys(seed=seed, step=0, sample_index=[0]),
-        ["synthetic@0"],
-    )
 
 
 def count_parameters(module: nn.Module) -> int:
@@ -100,7 +47,7 @@ def run_step(overrides: list[str]) -> dict[str, Any]:
     simulator = build_simulator(config).train()
     losses = build_list(config["loss"], AbstractLoss, "loss")
     optimizer, _ = build(config["optimizer"], AbstractOptimization, "optimizer").build(simulator, 400_000)
-    batch = synthetic_batch()
+    batch = video_batch(SIZE, NUM_STEPS, RAYS_PER_STEP)
     before = {name: parameter.detach().clone() for name, parameter in simulator.named_parameters()}
     peak_before, start, processor_start = _peak_bytes(), time.perf_counter(), time.process_time()
     output = simulator(batch)

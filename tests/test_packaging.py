@@ -16,7 +16,7 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = ("vpd-data", "vpd-train", "vpd-eval", "vpd-render", "vpd-info")
+COMMANDS = ("vpd-data", "vpd-train", "vpd-eval", "vpd-render", "vpd-bench", "vpd-info")
 
 
 def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess:
@@ -28,7 +28,7 @@ def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess:
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = tmp_path_factory.mktemp("source")
-    for name in ("src", "data_gen", "conf"):
+    for name in ("src", "data_gen", "benchmarks", "conf"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -64,13 +64,14 @@ def test_everything_imported_is_required():
         Requirement(line).name for line in (*project["dependencies"], *project["optional-dependencies"]["cluster"])
     }
     imported = set()
-    for path in [*(ROOT / "src").rglob("*.py"), *(ROOT / "data_gen").rglob("*.py")]:
+    for path in [path for folder in ("src", "data_gen", "benchmarks") for path in (ROOT / folder).rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 imported |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 imported.add(node.module.partition(".")[0])
-    own = {"vpd_lightning", "data_gen", "pytest"}  # the contract tests in vpd_lightning.testing run under pytest
+    # The contract tests in vpd_lightning.testing run under pytest; PyTorch's builds for GPUs bring triton themselves.
+    own = {"vpd_lightning", "data_gen", "benchmarks", "pytest", "triton"}
     packages = {"torch_cluster": ["torch-cluster"], **packages_distributions()}
     missing = {
         name
@@ -89,8 +90,9 @@ def test_wheel_holds_code_configuration_and_licence_but_no_tests(wheel: Path):
     assert "vpd_lightning/conf/train.yaml" in names
     assert "vpd_lightning/conf/experiment/mujoco_block.yaml" in names
     assert "data_gen/__init__.py" in names
+    assert "benchmarks/suites/scaling.py" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
-    assert not [name for name in names if name.startswith(("tests", "benchmarks", "docs"))]
+    assert not [name for name in names if name.startswith(("tests", "benchmarks/results/", "docs"))]
 
 
 @pytest.mark.slow

@@ -1,0 +1,1 @@
+"""Benchmarks: run time against error, against peers, against the plain way of doing the same. See README.md."""

@@ -1,0 +1,1 @@
+"""The paper written plainly in PyTorch, with our weights and without our tricks: what speed is compared with."""

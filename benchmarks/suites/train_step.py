@@ -1,0 +1,123 @@
+"""One training step against the paper written plainly: time, memory, agreement, and the distance to the floor."""
+
+from collections import defaultdict
+from pathlib import Path
+
+from torch import Tensor
+
+from benchmarks import plots
+from benchmarks.arithmetic import TRAINING, Work, dynamics_layers, edge_counts, encoder_layers, renderer_layers, work
+from benchmarks.measuring import Options, Result, Row, Stopwatch, copy_rate, device_peak, gemm_rate, row
+from benchmarks.memory_probe import peak_of
+from benchmarks.plain.neighbors import SEARCH
+from benchmarks.training_step import SCALES, STAGES, Step
+
+VARIANTS = ("plain", "fast", "saving", "bf16", "bounded", "surface")
+LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4  # relative; float32 sums in another order
+NOTES = {
+    "fast": "exact tricks alone",
+    "saving": "activations computed again in the backward pass",
+    "bf16": "autocast to bfloat16; not the same numbers",
+    "bounded": "early_stop, max_radius and share_rows_below; not the same numbers",
+    "surface": "another renderer: another loss, so no error",
+}
+
+
+def run(options: Options) -> Result:
+    """Measure all variants in turns.
+
+    Raises:
+        AssertionError: an exact variant disagrees with the plain path.
+    """
+    scale = SCALES[options.size]
+    steps = {variant: Step(variant, scale, options.device) for variant in VARIANTS}
+    seconds: dict[str, dict[str, list[float]]] = {variant: defaultdict(list) for variant in VARIANTS}
+    gradients: dict[str, Tensor] = {}
+    for repeat in range(options.repeats + 1):  # the first round warms up
+        for variant, step in steps.items():
+            watch = Stopwatch(options.device)
+            gradients[variant] = step(watch)
+            if repeat:
+                for name in (*STAGES, "other"):
+                    seconds[variant][name].append(watch.seconds.get(name, 0.0))
+                seconds[variant]["step"].append(sum(watch.seconds.values()))
+    probed = options.pick(
+        ("plain", "fast", "saving", "surface"), ("plain", "saving"), ("plain", "saving")
+    )  # each takes a process of its own
+    peaks = {variant: _peak(variant, step, options) if variant in probed else None for variant, step in steps.items()}
+    rows = [row("train_step/plain", seconds["plain"]["step"], peak_bytes=peaks["plain"], note=f"{SEARCH} neighbours")]
+    reference = gradients["plain"]
+    for variant in VARIANTS[1:]:
+        error = None
+        note = NOTES[variant]
+        if variant != "surface":
+            error = float((gradients[variant] - reference).norm() / reference.norm())
+            loss_error = abs(steps[variant].last_loss / steps["plain"].last_loss - 1)
+            note += f"; gradients (error) and loss ({loss_error:.0e}) relative to plain"
+            if variant in ("fast", "saving") and not (error < GRADIENT_TOLERANCE and loss_error < LOSS_TOLERANCE):
+                raise AssertionError(f"{variant} disagrees with plain: gradients {error:.1e}, loss {loss_error:.1e}")
+        here, there = seconds[variant]["step"], seconds["plain"]["step"]
+        rows.append(row(f"train_step/{variant}", here, "plain", there, error, None, peaks[variant], note))
+    for stage in (*STAGES, "other"):
+        here, there = seconds["fast"][stage], seconds["plain"][stage]
+        if max(here) > 0:  # on the plain path the graph is part of the dynamics
+            rows.append(row(f"stage/{stage}", here, "plain" if max(there) > 0 else "", there if max(there) > 0 else ()))
+    return Result(rows, _floors(steps["fast"], rows, options))
+
+
+def _peak(variant: str, step: Step, options: Options) -> int | None:
+    if options.device.type == "cuda":
+        return device_peak(step, options.device)
+    return peak_of("training_step:prepared", variant=variant, scale=options.size)["peak_bytes"]
+
+
+def _floors(step: Step, rows: list[Row], options: Options) -> dict[str, object]:
+    """Return operations and bytes of each stage's networks, and how near the measured times are to their floor."""
+    simulator, scale, batch = step.simulator, step.scale, step.batch
+    with_draws = batch.keys
+    previous = simulator.encoder(batch.context[:, 0], with_draws, "previous").particles
+    current = simulator.encoder(batch.context[:, 1], with_draws, "current").particles
+    counts = edge_counts(simulator.dynamics, previous, current)
+    rays = scale.rays * scale.steps
+
+    def several(one: Work) -> Work:
+        return Work(one.operations * scale.steps, one.bytes * scale.steps)
+
+    stages = {
+        "encode": work(encoder_layers(simulator.encoder, scale.image, scale.image, 2)),
+        "dynamics": several(work(dynamics_layers(simulator.dynamics, counts))),
+        "render": work(renderer_layers(simulator.renderer, rays)),
+    }
+    operations, moved = gemm_rate(options.device), copy_rate(options.device)
+    facts: dict[str, object] = {
+        "gemm_operations_per_second": operations,
+        "copied_bytes_per_second": moved,
+        "abstract_edges": counts.abstract_to_abstract,
+        "particles": int(current.mask.sum()),
+    }
+    measured = {item.name.split("/")[1]: item.seconds or 0.0 for item in rows if item.name.startswith("stage/")}
+    forward = 0.0
+    for name, amount in stages.items():
+        floor = amount.seconds(operations, moved)
+        forward += amount.operations / operations
+        facts[f"{name}_operations"], facts[f"{name}_bytes"] = amount.operations, amount.bytes
+        facts[f"{name}_floor_seconds"] = floor
+        facts[f"{name}_floor_share"] = floor / measured[name] if measured.get(name) else None
+    total = TRAINING * forward
+    facts["backward_floor_seconds"] = total - forward
+    facts["backward_floor_share"] = (total - forward) / measured["backward"]
+    fast, plain = (next(r.seconds for r in rows if r.name == f"train_step/{v}") for v in ("fast", "plain"))
+    facts["networks_floor_seconds"] = total
+    facts["networks_floor_share_fast"] = total / (fast or 1.0)
+    facts["networks_floor_share_plain"] = total / (plain or 1.0)
+    layers = renderer_layers(simulator.renderer, rays, is_plain=True)
+    plain_work = several(work(dynamics_layers(simulator.dynamics, counts, is_plain=True)))
+    as_written = stages["encode"].operations + plain_work.operations + work(layers).operations
+    facts["operations_saved"] = 1 - sum(amount.operations for amount in stages.values()) / as_written
+    return facts
+
+
+def draw(result: Result, path: Path) -> None:
+    """Draw time and memory of the variants beside the plain path."""
+    rows = [item for item in result.rows if item.name.startswith("train_step/")]
+    plots.bars(rows, "One training step", path)
