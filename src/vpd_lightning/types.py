@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.randomness import RandomKeys
 
 Border = TypeVar("Border", bound="_Border")
@@ -97,6 +98,39 @@ class Particles(_Border):
     @property
     def num_particles(self) -> int:
         return self.positions.shape[-2]
+
+    def without_padding(self) -> "Particles":
+        """Return the same particles with zeros in padding: NaN there would survive a product with zero."""
+        if self.mask.device.type == "cpu" and not _is_traced() and bool(self.mask.all()):
+            return self
+        names = ("positions", "features", "colors", "normals")
+        known = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return replace(self, **{name: torch.where(self.mask[..., None], value, 0.0) for name, value in known.items()})
+
+
+def require_finite(where: str, **inputs: Tensor) -> None:
+    """Refuse NaN and infinity by the name of the input.
+
+    That waits for the device, so it is left out where a compiler or a CUDA graph records; NaN then comes out as NaN.
+
+    Raises:
+        NonFiniteError: naming every input that is not finite.
+    """
+    if _is_traced():
+        return
+    finite = torch.stack([torch.isfinite(tensor).all() for tensor in inputs.values()])
+    if bool(finite.all()):
+        return
+    bad = [name for name, is_finite in zip(inputs, finite.tolist(), strict=True) if not is_finite]
+    raise NonFiniteError(
+        f"{where}: NaN or infinity in {' and '.join(bad)}.\n"
+        "A model that diverged, or damaged data; lower the learning rate or check the data with vpd-data validate."
+    )
+
+
+def _is_traced() -> bool:
+    """Whether what runs is being recorded, so that no number may be looked at."""
+    return torch.compiler.is_compiling() or (torch.cuda.is_available() and torch.cuda.is_current_stream_capturing())
 
 
 @dataclass(frozen=True)

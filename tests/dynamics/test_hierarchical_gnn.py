@@ -18,6 +18,7 @@ SMALL = {
     "location_scale": 0.1,
     "edge_capacity": None,
     "max_abstract_edges_per_node": None,
+    "feature_limit": 1e4,
     "compile": False,
     "neighbors_backend": "auto",
 }

@@ -23,6 +23,7 @@ def _dynamics() -> HierarchicalGNNDynamics:
         feature_dim=FEATURE_DIM, hidden_dim=HIDDEN_DIM, message_passing_steps=STEPS, num_abstract_nodes=NUM_ABSTRACT,
         max_abstract_neighbors=MAX_NEIGHBORS, r_s=R_S, r_a_s=R_A_S, location_scale=LOCATION_SCALE,
         neighbors_backend="auto", edge_capacity=None, max_abstract_edges_per_node=None, compile=False,
+        feature_limit=1e4,
     )  # fmt: skip
     # No weight stays at a value that would hide it: biases and layer norms are random too.
     generator = torch.Generator().manual_seed(0)

@@ -24,6 +24,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "edge_capacity": None,
         "compile": False,
         "max_abstract_edges_per_node": None,
+        "feature_limit": 1e4,
     },
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto"},
     f"{_RENDERER}splat.SplatRenderer": {"candidate_backend": "auto"},

@@ -21,7 +21,7 @@ from vpd_lightning.graph.incidence import carried
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.graph.static_graph import build_static_graph
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Particles, require_finite
 
 
 class HierarchicalGNNDynamics(AbstractDynamics):
@@ -38,6 +38,9 @@ class HierarchicalGNNDynamics(AbstractDynamics):
     # read; the appendix says that the initial feature of "the edges" is the relative position, so those have one too.
     # Paper: Algorithm 1 prints one edge set from the particles of both times to the abstract nodes, so both are added
     # up; MeshGraphNets, which the paper follows, would concatenate one sum per edge type (16,384 parameters more).
+    # Paper: features are kept within +-feature_limit. Nothing in Algorithm 1 bounds what is added to them step after
+    # step, and over hundreds of steps trained networks were seen to overflow; a limit far above what they learn changes
+    # nothing before that.
     # Paper: not printed and chosen here: 1024 abstract nodes, sum aggregation, no self loops. A current particle
     # without abstract node in reach gets a zero message and is decoded from its own encoding.
 
@@ -73,6 +76,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         r_s: float,
         r_a_s: float,
         location_scale: float,
+        feature_limit: float,
         neighbors_backend: str,
         edge_capacity: int | None,
         max_abstract_edges_per_node: int | None,
@@ -92,9 +96,10 @@ class HierarchicalGNNDynamics(AbstractDynamics):
                 raise ValueError(f"{name} must be at least 1, got {count}.")
         if message_passing_steps < 0:
             raise ValueError(f"message_passing_steps must be at least 0, got {message_passing_steps}.")
-        for name, value in {"r_s": r_s, "r_a_s": r_a_s, "location_scale": location_scale}.items():
+        positive = {"r_s": r_s, "r_a_s": r_a_s, "location_scale": location_scale, "feature_limit": feature_limit}
+        for name, value in positive.items():
             if not value > 0:
-                raise ValueError(f"{name} must be greater than 0 metres, got {value}.")
+                raise ValueError(f"{name} must be greater than 0, got {value}.")
         if neighbors_backend not in ("auto", *BACKENDS):
             raise ValueError(f"neighbors_backend must be auto or one of {BACKENDS}, got {neighbors_backend!r}.")
         if compile and edge_capacity is None:
@@ -102,7 +107,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         self.num_abstract_nodes = num_abstract_nodes
         self.max_abstract_neighbors = max_abstract_neighbors
         self.r_s, self.r_a_s = float(r_s), float(r_a_s)
-        self.location_scale = float(location_scale)
+        self.location_scale, self.feature_limit = float(location_scale), float(feature_limit)
         self.neighbors_backend = neighbors_backend
         self.edge_capacity, self.max_abstract_edges_per_node = edge_capacity, max_abstract_edges_per_node
         self.is_compiled = compile
@@ -159,6 +164,12 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         generators = keys.generators(f"abstract/{rollout_step}")
         if self.edge_capacity is not None and current.num_particles:
             return self._static_advance(previous, current, generators, num_abstract_nodes)
+        previous, current = previous.without_padding(), current.without_padding()
+        require_finite(
+            "Dynamics",
+            positions=torch.cat([previous.positions, current.positions], dim=1),
+            features=torch.cat([previous.features, current.features], dim=1),
+        )
         graph = build_graph(
             previous,
             current,
@@ -218,6 +229,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
             valid = current.mask[..., None]
             positions = torch.where(valid, current.positions + delta_location, current.positions)
             features = current.features + delta_feature.to(current.features.dtype)
+            features = features.clamp(-self.feature_limit, self.feature_limit)
             features = torch.where(valid, features, current.features)
         return positions, features
 

@@ -24,7 +24,7 @@ from vpd_lightning.dynamics.rigid_motion import (
 )
 from vpd_lightning.dynamics.shading import MovingShading, StaticShading
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Particles, require_finite
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,14 @@ class InertialDynamics(AbstractDynamics):
         """Estimate the first velocities and attach the moving candidates to anchors."""
         if previous.colors is None or current.colors is None or current.normals is None:
             raise ValueError("the inertial dynamics needs observed colors and normals; set encoder.use_normals=true")
+        previous, current = previous.without_padding(), current.without_padding()
+        require_finite(
+            "Dynamics",
+            positions=torch.cat([previous.positions, current.positions], dim=1),
+            features=current.features,
+            colors=torch.cat([previous.colors, current.colors], dim=1),
+            normals=current.normals,
+        )
         with torch.autocast(current.positions.device.type, enabled=False):  # geometry in full precision
             return self._first_memory(previous, current)
 
@@ -183,6 +191,7 @@ class InertialDynamics(AbstractDynamics):
         """Advance one step; see the class."""
         if current.num_particles == 0:
             return current, memory
+        current = current.without_padding()
         device_type = current.positions.device.type
         with torch.autocast(device_type, enabled=False):  # geometry in full precision
             return self._step(current, memory)

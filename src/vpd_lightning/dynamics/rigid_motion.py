@@ -170,7 +170,7 @@ def match_locally_rigid(
         # The product form of the squared distance keeps its digits here: both sets are centred on a body's size.
         local = moved - origin
         square = local.square().sum(dim=-1)[..., None] + goal_square - 2 * local @ (target_positions - origin).mT
-        logits = -square / (2 * scale**2) - color_cost
+        logits = -square.clamp(min=0) / (2 * scale**2) - color_cost
         top = logits.amax(dim=-1, keepdim=True).clamp(min=-80.0)
         kernel = torch.exp(logits - top)
         total = kernel.sum(dim=-1, keepdim=True).clamp(min=1e-12)

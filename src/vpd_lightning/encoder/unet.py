@@ -14,7 +14,7 @@ from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.geometry.normals import depth_normals
 from vpd_lightning.geometry.workspace import choose, inside_workspace
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles, RGBDFrames
+from vpd_lightning.types import Particles, RGBDFrames, require_finite
 
 # Share of pixels below which the last convolution is gathered at the chosen ones (measured on a CPU): at 8 % of the
 # pixels that is four times faster than convolving all of them, at 100 % ten times slower. Same numbers either way.
@@ -86,6 +86,10 @@ class UNetEncoder(AbstractEncoder):
             EmptyWorkspaceError: no measured pixel of a batch member lies in the workspace.
         """
         rgb = frames.rgb if frames.rgb.is_floating_point() else frames.rgb.to(frames.depth.dtype) / 255
+        cameras = frames.cameras
+        require_finite(
+            "Encoder", rgb=rgb, cameras=torch.cat([cameras.intrinsics.flatten(), cameras.cam_to_world.flatten()])
+        )
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
         measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)

@@ -32,12 +32,17 @@ def depth_normals(
         known = torch.isfinite(torch.minimum(forward_step, backward_step))
         return chosen * known[..., None]
 
-    normals = torch.linalg.cross(tangent(-2), tangent(-1))
-    length = normals.norm(dim=-1, keepdim=True)
-    normals = normals / length.clamp(min=1e-12)
+    # Unit tangents first: a product of two steps would leave the range of small worlds.
+    normals = _unit(torch.linalg.cross(_unit(tangent(-2)), _unit(tangent(-1))))
     center = cameras.cam_to_world[..., :3, 3][..., None, None, :]
     towards = ((center - points) * normals).sum(dim=-1, keepdim=True)
     normals = torch.where(towards < 0, -normals, normals)
     inner = torch.zeros_like(valid)
     inner[..., 1:-1, 1:-1] = True
     return normals * (valid & inner)[..., None]
+
+
+def _unit(vectors: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
+    """Return vectors of length one, and zero where the length is zero."""
+    length = vectors.norm(dim=-1, keepdim=True)
+    return vectors / torch.where(length > 0, length, 1.0)

@@ -21,7 +21,7 @@ from vpd_lightning.renderer.radiance_field import RadianceField
 from vpd_lightning.renderer.row_sharing import SharedRows
 from vpd_lightning.renderer.sample_features import SampleFeatures
 from vpd_lightning.renderer.volumetric import ray_weights
-from vpd_lightning.types import Particles, Rays, RenderedRays
+from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
 
 class PointNeRFRenderer(AbstractRenderer):
@@ -143,6 +143,13 @@ class PointNeRFRenderer(AbstractRenderer):
             NonFiniteError: when a particle or a ray is not finite.
             ValueError: when ``keys`` do not name one sample per member of the batch axis.
         """
+        particles = particles.without_padding()
+        require_finite(
+            "Rendering",
+            positions=particles.positions,
+            features=particles.features,
+            rays=torch.cat([rays.origins, rays.directions]),
+        )
         batch_size, num_rays = rays.origins.shape[:2]
         features = self._sample_features(particles)
         self._num_evaluated = self._num_shared = 0

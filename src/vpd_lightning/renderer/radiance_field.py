@@ -81,7 +81,9 @@ class RadianceField(nn.Module):
                 nn.init.zeros_(module.bias)
         nn.init.zeros_(self.density.weight)
         is_relu = density_activation == "relu"
-        nn.init.constant_(self.density.bias, initial_density if is_relu else math.log(math.expm1(initial_density)))
+        # The inverse of softplus, log(e^x - 1), in a form that no density overflows.
+        bias = initial_density if is_relu else initial_density + math.log(-math.expm1(-initial_density))
+        nn.init.constant_(self.density.bias, bias)
 
     def forward(
         self,

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.renderer.precision import at_least_float32, full_precision
+from vpd_lightning.types import require_finite
 
 CANDIDATE_BACKENDS = ("auto", "torch", "numba")
 
@@ -75,7 +75,7 @@ class RaySearch:
         positions = at_least_float32(positions.detach())
         if not bool(valid.all()):
             positions = torch.where(valid[..., None], positions, 0.0)
-        require_finite(positions)
+        require_finite("Ray search", positions=positions)
         self.backend = resolved_backend(backend, positions.device)
         self._positions, self._valid = positions, valid
         self._prepared: list[Any] = []
@@ -99,7 +99,7 @@ class RaySearch:
         """
         dtype = self._positions.dtype
         origins, directions = origins.detach().to(dtype), directions.detach().to(dtype)
-        require_finite(origins, directions)
+        require_finite("Ray search", rays=torch.cat([origins, directions]))
         with full_precision(origins):
             if self.backend == "numba":
                 from vpd_lightning.renderer.ray_search_numba import search
@@ -139,15 +139,6 @@ def check_backend(backend: str) -> None:
         raise ValueError(f"candidate_backend must be one of {', '.join(CANDIDATE_BACKENDS)}, got {backend!r}.")
 
 
-def require_finite(*tensors: Tensor) -> None:
-    """Raise NonFiniteError unless positions and rays are finite; one pass over each, no copy of a mask."""
-    if not bool(torch.isfinite(sum(tensor.sum() for tensor in tensors))):  # type: ignore[arg-type]
-        raise NonFiniteError(
-            "Rendering: a particle position or a ray is NaN or infinite.\n"
-            "A model that diverged, or damaged poses; lower the learning rate or check the data with vpd-data validate."
-        )
-
-
 def _closest_torch(
     positions: Float[Tensor, "batch particle 3"],
     valid: Bool[Tensor, "batch particle"],
@@ -165,7 +156,8 @@ def _closest_torch(
     if found == 0 or batch_size == 0:
         return Candidates(index, mask)
     # |p - o|^2 - ((p - o) . d)^2, both as products of [p, |p|^2, 1]; centred, so that little cancels.
-    center = positions.mean(dim=1, keepdim=True)
+    num_valid = valid.sum(dim=1).clamp(min=1)[:, None, None]
+    center = torch.where(valid[..., None], positions, 0.0).sum(dim=1, keepdim=True) / num_valid
     p, o = positions - center, origins - center
     one = torch.ones_like(p[..., :1])
     lifted = torch.cat([p, p.square().sum(-1, keepdim=True), one], dim=-1).transpose(1, 2)

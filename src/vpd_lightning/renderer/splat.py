@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.ray_search import BesideAndBehind, RaySearch, check_backend
-from vpd_lightning.types import Particles, Rays, RenderedRays
+from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
 
 class SplatRenderer(AbstractRenderer):
@@ -62,6 +62,13 @@ class SplatRenderer(AbstractRenderer):
 
     def forward(self, particles: Particles, rays: Rays, keys: RandomKeys | None) -> RenderedRays:
         """Render rays (``batch ray 3``); nothing here is random, so ``keys`` is not used."""
+        particles = particles.without_padding()
+        require_finite(
+            "Rendering",
+            positions=particles.positions,
+            features=particles.features,
+            rays=torch.cat([rays.origins, rays.directions]),
+        )
         num_rays = rays.origins.shape[1]
         if particles.num_particles == 0:  # maxima and products need something to work on
             pad = nn.functional.pad

@@ -17,7 +17,7 @@ from vpd_lightning.renderer.radiance_field import RadianceField
 from vpd_lightning.renderer.ray_candidates import CandidateTable, RayCandidates, depth_hints, ray_features
 from vpd_lightning.renderer.ray_search import Candidates, check_backend
 from vpd_lightning.renderer.volumetric import composite
-from vpd_lightning.types import Particles, Rays, RenderedRays
+from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
@@ -111,6 +111,13 @@ class SurfaceRenderer(AbstractRenderer):
             NonFiniteError: when a particle or a ray is not finite.
             ValueError: when ``keys`` do not name one sample per member of the batch axis.
         """
+        particles = particles.without_padding()
+        require_finite(
+            "Rendering",
+            positions=particles.positions,
+            features=particles.features,
+            rays=torch.cat([rays.origins, rays.directions]),
+        )
         batch_size, num_rays = rays.origins.shape[:2]
         # One offset for all samples of a ray around the hints, one number for each uniform sample and each hint.
         shape = (num_rays, self.num_samples + 1)
