@@ -75,7 +75,7 @@ def features(options: Options) -> Result:
 def train_step(options: Options) -> Result:
     """One step at the paper's scale: the plain path in float32, ours in float32, bf16, compiled, with surface."""
     scale = options.pick(PAPER, PAPER, TINY)
-    variants = ("plain", "fast", "saving", "bf16", "compiled", "surface")
+    variants = ("plain", "fast", "saving", "bf16", "compiled", "surface", "surface_bf16")
     rows: list[Row] = []
     facts: dict[str, Any] = {}
     plain_seconds: list[float] = []
@@ -95,7 +95,7 @@ def train_step(options: Options) -> Result:
         if variant == "plain":
             reference, plain_seconds = gradients, seconds
         error = None
-        if variant != "surface" and reference is not None:
+        if not variant.startswith("surface") and reference is not None:
             error = float((gradients - reference).norm() / reference.norm())
         note = "gradients relative to plain" if error is not None else "another renderer"
         baseline = "" if variant == "plain" else "plain"

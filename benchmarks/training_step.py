@@ -55,8 +55,8 @@ class Step:
 
     ``fast`` is our path with everything kept for the backward pass; ``plain`` the same weights on the plain path;
     ``saving`` computes activations again instead of keeping them; ``bf16`` multiplies in bfloat16; ``bounded`` adds
-    the renderer's bounded omissions; ``surface`` has the other renderer; ``compiled`` gives the dynamics fixed shapes
-    and hands it to torch.compile (on a GPU a CUDA graph), in bfloat16.
+    the renderer's bounded omissions; ``surface`` has the other renderer, ``surface_bf16`` in bfloat16; ``compiled``
+    gives the dynamics fixed shapes and hands it to torch.compile (on a GPU a CUDA graph), in bfloat16.
     """
 
     def __init__(self, variant: str, scale: Scale, device: torch.device) -> None:
@@ -76,7 +76,7 @@ class Step:
                 stack.enter_context(plain(self.simulator, self.scale.steps))
             stack.enter_context(watched(self.simulator, watch))
             self.optimizer.zero_grad(set_to_none=True)
-            is_bf16 = self.variant in ("bf16", "compiled")
+            is_bf16 = self.variant in ("bf16", "compiled", "surface_bf16")
             with torch.autocast(self.device.type, torch.bfloat16) if is_bf16 else nullcontext():
                 with watch.stage("other"):
                     output = self.simulator(self.batch)
@@ -95,7 +95,7 @@ def build_simulator(variant: str, scale: Scale) -> Simulator:
     dynamics = {"num_abstract_nodes": scale.abstract_nodes, **(scale.dynamics or {})}
     option, renderer = "point_nerf", dict(scale.renderer or {})
     saves = variant == "saving"
-    if variant == "surface":
+    if variant.startswith("surface"):
         option, renderer = "surface", {}
     else:
         renderer["checkpoint_chunks"] = saves

@@ -24,8 +24,8 @@ def run(options: Options) -> Result:
 
 
 def _rows(name: str, model: Model, options: Options) -> list[Row]:
-    steps = options.pick(32, 8, 2)
-    clip = model.clip(steps)
+    steps, judged = options.pick(32, 8, 2), options.pick(8, 8, 2)  # recordings may end before the rollout does
+    clip = model.clip(judged)
     views = model.input_views
     camera = clip.target_cameras[0][views[:1]].to(options.device)
     rgb, depth = clip.rgb[:, views].to(options.device), clip.depth[:, views].to(options.device)
@@ -34,13 +34,15 @@ def _rows(name: str, model: Model, options: Options) -> list[Row]:
         return simulator.encode(rgb, depth, clip.cameras[:, views].to(options.device))
 
     rows = _timed(name, model.simulator, encode, camera, steps, options)
-    truth = clip.target_rgb[:steps, views[0]].to(options.device).float() / 255
-    states = model.simulator.rollout(encode(model.simulator), steps)
+    truth = clip.target_rgb[:judged, views[0]].to(options.device).float() / 255
+    states = model.simulator.rollout(encode(model.simulator), judged)
     picture = model.simulator.render(states, camera)[:, 0]
     error = (picture - truth).square().mean(dim=(1, 2, 3)).clamp(min=1e-10)
     psnr = float((-10 * error.log10()).mean())
     whole = rows[-1]
-    rows[-1] = Row(**{**vars(whole), "psnr": psnr, "note": f"{whole.note}; PSNR of input view {views[0]}"})
+    rows[-1] = Row(
+        **{**vars(whole), "psnr": psnr, "note": f"{whole.note}; PSNR of input view {views[0]}, {judged} steps"}
+    )
     return rows
 
 

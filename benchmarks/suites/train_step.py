@@ -12,7 +12,7 @@ from benchmarks.memory_probe import peak_of
 from benchmarks.plain.neighbors import SEARCH
 from benchmarks.training_step import SCALES, STAGES, Step
 
-VARIANTS = ("plain", "fast", "saving", "bf16", "bounded", "surface")
+VARIANTS = ("plain", "fast", "saving", "bf16", "bounded", "surface", "surface_bf16")
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4  # relative; float32 sums in another order
 NOTES = {
     "fast": "exact tricks alone",
@@ -20,6 +20,7 @@ NOTES = {
     "bf16": "autocast to bfloat16; not the same numbers",
     "bounded": "early_stop, max_radius and share_rows_below; not the same numbers",
     "surface": "another renderer: another loss, so no error",
+    "surface_bf16": "another renderer, autocast to bfloat16: another loss, so no error",
 }
 
 
@@ -50,7 +51,7 @@ def run(options: Options) -> Result:
     for variant in VARIANTS[1:]:
         error = None
         note = NOTES[variant]
-        if variant != "surface":
+        if not variant.startswith("surface"):
             error = float((gradients[variant] - reference).norm() / reference.norm())
             loss_error = abs(steps[variant].last_loss / steps["plain"].last_loss - 1)
             note += f"; gradients (error) and loss ({loss_error:.0e}) relative to plain"

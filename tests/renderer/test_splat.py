@@ -183,7 +183,7 @@ def test_a_particle_that_is_not_finite_is_refused_by_name():
     scene = particles()
     scene.positions[0, 3, 1] = float("nan")
 
-    with pytest.raises(NonFiniteError, match="particle position"):
+    with pytest.raises(NonFiniteError, match="in positions"):
         renderer()(scene, rays(), None)
 
 
