@@ -16,7 +16,8 @@ from typing import Any
 
 import torch
 
-from benchmarks.measuring import Row, interleaved, row, seconds_now
+from benchmarks.measuring import Result, Row, interleaved, row, seconds_now
+from benchmarks.results_files import default_folder, write
 from vpd_lightning.config import build, compose
 from vpd_lightning.config.sleeping import with_sleeping
 from vpd_lightning.data.manifest import load_manifest
@@ -133,9 +134,11 @@ def as_rows(name: str, results: Mapping[str, Rollout]) -> list[Row]:
         note = (
             f"{1 - one.awake_share:.0%} asleep, {1 - one.active_share:.0%} not computed; centroid error "
             f"{one.centroid_error:.4f} m (plain {plain.centroid_error:.4f}); static drift median "
-            f"{one.static_drift_median:.4f} m (plain {plain.static_drift_median:.4f})"
+            f"{one.static_drift_median:.4f} m (plain {plain.static_drift_median:.4f}), largest "
+            f"{one.static_drift_max:.4f} m (plain {plain.static_drift_max:.4f})"
         )
         error = one.centroid_error - plain.centroid_error
+        label = label.removeprefix("{}, ")  # settings as they are in conf/
         rows.append(
             row(f"{name}: sleeping {label}", [one.seconds], f"{name}: plain", [plain.seconds], error, note=note)
         )
@@ -168,7 +171,7 @@ def step_costs(
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--ckpt", nargs="*", type=Path, default=[])
     parser.add_argument("--data", type=Path)
@@ -177,18 +180,22 @@ def main() -> None:
     parser.add_argument("--steps", nargs="+", type=int, default=[8, 100])
     parser.add_argument("--rest-speeds", nargs="*", type=float, default=[])
     parser.add_argument("--step-costs", nargs="*", type=int, default=[], help="numbers of particles")
+    parser.add_argument("--out", type=Path, default=default_folder(), help="folder of sleeping_cpu.json")
     options = parser.parse_args()
     torch.set_num_threads(1)  # so that the clock counts this process alone
     start = time.perf_counter()
     variants = [{"rest_speed": speed} for speed in options.rest_speeds] or [{}]
+    rows: list[Row] = []
     for path in options.ckpt:
         results = compare(path, options.split, options.clips, options.steps, variants, options.data)
         for name, one in results.items():
             values = "  ".join(f"{item.name} {getattr(one, item.name):.4f}" for item in fields(Rollout))
             print(f"{path}: {name}: {values}", flush=True)
+        rows += as_rows("/".join(path.parts[-4:-2]), results)
     for count in options.step_costs:
-        for line in step_costs(count, (1.0, 0.5, 0.2, 0.05, 0.0), 3):
-            print(f"{line.name}: {line.seconds:.4f} s, {line.ratio:.2f}x", flush=True)
+        rows += step_costs(count, (1.0, 0.5, 0.2, 0.05, 0.0), 3)
+    note = f"{options.split} split, {options.clips} clips; error: metres by which the centroid error grew"
+    print(write("sleeping", torch.device("cpu"), Result(rows, {"clips": note}), options.out))
     print(f"{time.perf_counter() - start:.0f} s")
 
 
