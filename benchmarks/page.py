@@ -1,9 +1,11 @@
 """Write the measured figures into ``docs/benchmarks.md``: ``python -m benchmarks.page [RESULTS_FOLDER]``.
 
 No figure on that page is typed by hand. Between ``<!-- results: FILE VIEW -->`` and ``<!-- end of results -->`` stands
-what this module made of ``FILE.json``; VIEW is ``table``, ``facts``, ``floors`` (of train_step) or ``plot``.
+what this module made of ``FILE.json``; VIEW is ``table``, ``facts``, ``floors`` (of train_step),
+``memory`` (of memory_table) or ``plot``.
 """
 
+import json
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -12,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring import Row
+from benchmarks.memory_table import GIB, markdown
 from benchmarks.results_files import default_folder, read, shown, table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,7 +42,7 @@ def filled(text: str, folder: Path) -> str:
             raise ValueError(f"There is no view {view!r}; known are {', '.join(VIEWS)}.")
         path = folder / f"{match['file']}.json"
         if path.exists():
-            content = VIEWS[view](read(path), path)
+            content = VIEWS[view](json.loads(path.read_text()) if view == "memory" else read(path), path)
         else:
             content = f"Not measured: `{path.name}` is not among the results."
         return f"{match[1]}{content}\n{match[4]}"
@@ -94,6 +97,13 @@ def _plot(content: dict[str, Any], path: Path) -> str:
     return f"![{content['suite']} on {content['device']}](../benchmarks/results/{picture})"
 
 
+def _memory(content: dict[str, Any], path: Path) -> str:
+    """The accounting of ``memory_table``, whose rows are its own, and the steps that were really taken."""
+    measured = ", ".join(f"{item['peak'] / GIB:.2f} GiB with {item['particles']:,}" for item in content["measured"])
+    taken = f"Peak of a process that takes one dynamics step, forward and backward: {measured}."
+    return f"{markdown(content['rows'])}\n\n{taken}"
+
+
 def _machine(content: dict[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in content["versions"].items())
     return f"{content['device']}; {versions}."
@@ -104,6 +114,7 @@ VIEWS: dict[str, Callable[[dict[str, Any], Path], str]] = {
     "facts": _facts,
     "floors": _floors,
     "plot": _plot,
+    "memory": _memory,
 }
 
 

@@ -6,9 +6,7 @@ instructions: 2 million cycles), 12.6 MB written and 10 MB of indices and querie
 and the loops around them were expected to double that; measured were 6 to 8 ms, the definition took 95 to 110 ms.
 """
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -16,6 +14,7 @@ from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from vpd_lightning.renderer.fused_loops_numba import KERNELS, LANES, add_gradients, sum_features
+from vpd_lightning.threads import in_threads
 
 _FORWARD_SLICE = 4096
 """Queries of one task; a query's result does not depend on it."""
@@ -58,7 +57,7 @@ def forward(
         q, p, z, i, m, t, o = (array[member] for array in arrays)
         return sum_features(q[part], p, z, i[part], m[part], t[part], o[part], *kernels)
 
-    if not all(_in_threads(work, tasks)):
+    if not all(in_threads(lambda task: work(*task), tasks)):
         raise IndexError(f"A neighbour's index is outside of the {positions.shape[-2]} particles.")
     return out[..., :num_kernels, :width], table
 
@@ -98,17 +97,8 @@ def backward(
             q[part], p, z, t[part], g[part], gq[part], *(buffer[member, number] for buffer in buffers), *kernels
         )
 
-    _in_threads(work, tasks)
+    in_threads(lambda task: work(*task), tasks)
     return grad_queries, _summed(grad_positions), _summed(grad_features)[..., :width]
-
-
-def _in_threads(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[Any]:
-    num_threads = min(torch.get_num_threads(), len(tasks))
-    if num_threads <= 1:
-        return [work(*task) for task in tasks]
-    # One pool per call: a pool that is kept does not survive a fork.
-    with ThreadPoolExecutor(num_threads) as pool:
-        return list(pool.map(lambda task: work(*task), tasks))
 
 
 def _summed(parts: Float[Tensor, "set slice particle width"]) -> Float[Tensor, "set particle width"]:

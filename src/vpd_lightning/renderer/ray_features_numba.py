@@ -4,7 +4,6 @@ The twin of the plain sums in ``ray_candidates``, for float32 on a CPU. Nothing 
 backward pass computes weights again, so that training keeps no ``[ray, sample, candidate, kernel]`` either.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, no_type_check
 
 import numba
@@ -12,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from vpd_lightning.threads import in_threads
 
 _NUM_SLICES = 8
 """Rays are cut into this many runs, whatever the number of threads; no sum crosses them."""
@@ -57,13 +58,7 @@ def _in_slices(kernel: Any, tensors: Any, num_neighbors: int, kernels: Any, more
     def run(part: int) -> None:
         kernel(bounds[part], bounds[part + 1], *arrays, num_neighbors, *kernels, *results)
 
-    num_threads = min(torch.get_num_threads(), _NUM_SLICES)
-    if num_threads == 1 or num_rays < 64:
-        for part in range(_NUM_SLICES):
-            run(part)
-        return
-    with ThreadPoolExecutor(num_threads) as pool:
-        list(pool.map(run, range(_NUM_SLICES)))
+    in_threads(run, range(_NUM_SLICES))
 
 
 _HALF, _ONE, _TWO_23, _BIAS = (np.float32(value) for value in (0.5, 1.0, 2.0**23, 127.0))

@@ -7,18 +7,17 @@ almost every sphere is passed over, and almost nothing is inserted that does not
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import no_type_check
 
 import numba
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vpd_lightning.graph.ordering import build_blocks, morton_order
 from vpd_lightning.renderer.ray_search import BesideRay, RayScore
+from vpd_lightning.threads import in_threads
 
 _BLOCK = 16
 """Particles of a block, and blocks of a group."""
@@ -97,13 +96,7 @@ def search(
         _scored_search(given, score, indices[member], masks[member])
 
     tasks = [(member, part) for member in range(len(particles)) for part in range(num_slices)]
-    num_threads = min(torch.get_num_threads(), len(tasks))
-    if num_threads <= 1:
-        for task in tasks:
-            run(task)
-        return
-    with ThreadPoolExecutor(num_threads) as pool:
-        list(pool.map(run, tasks))
+    in_threads(run, tasks)
 
 
 def _scored_search(given: tuple[np.ndarray, ...], score: RayScore, index: np.ndarray, mask: np.ndarray) -> None:

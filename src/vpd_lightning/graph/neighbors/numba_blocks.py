@@ -1,7 +1,6 @@
 """Exact search on the CPU in compiled loops over a tree of boxes: the fast choice there wherever numba is installed."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from torch import Tensor
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.graph.neighbors.contract import Neighbors, measured, squared_norm
 from vpd_lightning.graph.ordering import build_blocks, morton_order
+from vpd_lightning.threads import in_threads
 
 _QUERIES_PER_SLICE = 8192
 """What one thread takes at a time. A slice clears a note per point, so it should not have few queries."""
@@ -130,12 +130,7 @@ def _are_coherent(queries: Float[Tensor, "query 3"]) -> bool:
 def _in_slices(count: int, work: Callable[[int, int], Any]) -> list[Any]:
     """Call ``work(start, stop)`` for slices of fixed size, on as many threads as torch uses; return its results."""
     starts = range(0, count, _QUERIES_PER_SLICE)
-    stops = [min(start + _QUERIES_PER_SLICE, count) for start in starts]
-    threads = min(torch.get_num_threads(), len(starts))
-    if threads <= 1:
-        return [work(start, stop) for start, stop in zip(starts, stops, strict=True)]
-    with ThreadPoolExecutor(threads) as executor:
-        return list(executor.map(work, starts, stops))
+    return in_threads(lambda start: work(start, min(start + _QUERIES_PER_SLICE, count)), starts)
 
 
 def _tree(
