@@ -20,7 +20,7 @@ STAMP := $(VENV)/.installed
 export MPLBACKEND = Agg
 
 .PHONY: help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
-	types imports cluster bench paper-step wheel clean
+	types imports cluster bench stability paper-step wheel clean
 
 help: ## List the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -64,8 +64,8 @@ video-demo: $(STAMP) ## Film a predicted rollout of the demo
 test: $(STAMP) ## Run all tests (no GPU and no torch-cluster needed; under 10 minutes on two cores)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-test-fast: $(STAMP) ## Run the tests that are not marked slow (under 2 minutes)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"
+test-fast: $(STAMP) ## Run the tests that are not marked slow, without the stability matrix (under 2 minutes)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" --ignore=tests/stability
 
 check: format-check lint types imports test ## Everything that must pass before a change goes in
 
@@ -93,6 +93,9 @@ cluster: $(STAMP) ## Build and install torch-cluster (needs a C++ compiler; 10 t
 BENCH_MODELS = $(wildcard runs/bench/*/checkpoints/last.ckpt)
 comma := ,
 empty :=
+
+stability: $(STAMP) ## Run the numerical stability matrix; the last line counts its cases
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/stability -n $(WORKERS) --dist loadfile -q
 
 bench: $(STAMP) ## Measure all suites on the CPU, one thread, in under 15 minutes; writes benchmarks/results and its page
 	OMP_NUM_THREADS=1 $(BIN)/vpd-bench suite=all device=cpu "ckpt=[$(subst $(empty) $(empty),$(comma),$(strip $(BENCH_MODELS)))]"
