@@ -56,12 +56,12 @@ class Step:
     ``fast`` is our path with everything kept for the backward pass; ``plain`` the same weights on the plain path;
     ``saving`` computes activations again instead of keeping them; ``bf16`` multiplies in bfloat16; ``bounded`` adds
     the renderer's bounded omissions; ``surface`` has the other renderer, ``surface_bf16`` in bfloat16; ``compiled``
-    gives the dynamics fixed shapes and hands it to torch.compile (on a GPU a CUDA graph), in bfloat16.
+    gives the dynamics fixed shapes and, on a GPU, hands it to torch.compile (a CUDA graph), in bfloat16.
     """
 
     def __init__(self, variant: str, scale: Scale, device: torch.device) -> None:
         self.variant, self.scale, self.device = variant, scale, device
-        self.simulator = build_simulator(variant, scale).to(device).train()
+        self.simulator = build_simulator(variant, scale, device.type == "cuda").to(device).train()
         self.batch: VideoBatch = video_batch(scale.image, scale.steps, scale.rays).to(device)
         self.loss = PixelLoss(weight=1.0, coarse_weight=1.0)
         # A rate of zero: all the work, and every repetition sees the same weights.
@@ -90,7 +90,7 @@ class Step:
         return torch.cat([p.grad.flatten() for p in self.simulator.parameters() if p.grad is not None]).double()
 
 
-def build_simulator(variant: str, scale: Scale) -> Simulator:
+def build_simulator(variant: str, scale: Scale, is_gpu: bool) -> Simulator:
     """Build the simulator of a variant; variants with the same networks have the same weights."""
     dynamics = {"num_abstract_nodes": scale.abstract_nodes, **(scale.dynamics or {})}
     option, renderer = "point_nerf", dict(scale.renderer or {})
@@ -103,7 +103,7 @@ def build_simulator(variant: str, scale: Scale) -> Simulator:
         known = stages.section("renderer/point_nerf")
         renderer |= {key: value for key, value in BOUNDED.items() if key in known}
     if variant == "compiled":
-        dynamics |= {"edge_capacity": EDGES_PER_NODE * scale.abstract_nodes, "compile": True}
+        dynamics |= {"edge_capacity": EDGES_PER_NODE * scale.abstract_nodes, "compile": is_gpu}
     return stages.build_simulator(
         "mujoco",
         (scale.encoder, {"num_particles": scale.particles}),

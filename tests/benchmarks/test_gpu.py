@@ -29,6 +29,16 @@ def test_rehearsed_part_is_measured_once(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("part", ["dynamics", "train_step"])
+def test_every_variant_of_a_part_can_be_rehearsed(part: str, tmp_path: Path):
+    assert gpu.main([*REHEARSE, "--only", part, "--out", str(tmp_path)]) == 0
+
+    rows = read(tmp_path / f"gpu_{part}_cpu.json")["rows"]
+    assert any("compiled" in item.name for item in rows)
+    assert all(item.seconds is not None for item in rows)
+
+
+@pytest.mark.slow
 def test_rehearsed_feature_kernel_agrees_with_float64(tmp_path: Path):
     pytest.importorskip("triton")
 
