@@ -171,6 +171,8 @@ def test_stopped_with_workers_leaves_no_half_file(tmp_path: Path, number: signal
         env={**os.environ, "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}"},
         stderr=subprocess.PIPE,
         start_new_session=True,
+        # A shell lets what it starts in the background ignore Ctrl-C, tests included, and that is inherited.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
     while not list(out.glob("train/*.h5")) and time.monotonic() < deadline:
