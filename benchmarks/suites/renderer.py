@@ -21,7 +21,7 @@ SWITCHES: dict[str, Any] = {
     "features_backend": "torch",
     "checkpoint_chunks": False,
     "early_stop": 1e-3,
-    "max_radius": 1.0,
+    "max_radius": 2.06,  # features off by at most 1e-3 of the largest: bounds.radius_for of the paper's MuJoCo kernels
     "share_rows_below": 1e-3,
 }
 OFF = ("reuse_coarse", "sort_particles", "features_backend", "checkpoint_chunks")
@@ -136,7 +136,7 @@ def _switches(particles: Particles, options: Options) -> list[Row]:
     settings |= {f"{key}={value}": {key: value} for key, value in SWITCHES.items() if key in known}
     models = {name: volume(options, **changes) for name, changes in settings.items()}
     rows = []
-    for kind, make in (("frame", without_gradient), ("step", with_gradient)):
+    for kind, make in (("rays", without_gradient), ("step", with_gradient)):
         seconds = interleaved(
             {name: make(model, particles, rays) for name, model in models.items()}, options.repeats, options.device
         )
