@@ -1,19 +1,58 @@
-"""What is in a data set, in words and as a contact sheet."""
+"""What is in a data set: in words, as contact sheets, as a plan of the cameras, and as a point cloud."""
 
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vpd_lightning.data.camera_plot import draw_cameras
+from vpd_lightning.data.contact_sheet import trajectory_sheet, view_sheet
 from vpd_lightning.data.ground_truth import has_state
 from vpd_lightning.data.manifest import load_manifest
+from vpd_lightning.data.pictures import write_figure, write_png
+from vpd_lightning.data.ply import write_ply
+from vpd_lightning.data.point_cloud import draw_points, merged_points
 from vpd_lightning.data.reader import TrajectoryReader
-from vpd_lightning.data.schema import AtomicPath
 from vpd_lightning.errors import DataError
 
 SHEET_NAME = "contact_sheet.png"
-_MAX_ROWS, _MAX_VIEWS, _MIN_SIDE = 8, 8, 96
-_GAP = 2
+TRAJECTORIES_NAME, CAMERAS_NAME = "trajectories.png", "cameras.png"
+POINTS_NAME, POINTS_PICTURE_NAME = "points.ply", "points.png"
+
+
+def inspect_dataset(path: str | Path, out: Path | None = None) -> list[Path]:
+    """Draw everything there is to see of a data set folder or one trajectory file; return the files written.
+
+    A contact sheet of the first trajectory, one of the trajectories (of a folder), a plan of the cameras, and the
+    merged point cloud of the middle frame inside the workspace as PLY and as a picture. ``out`` is a folder, or the
+    ``.png`` path of the contact sheet, beside which the rest goes; by default the data set's own folder.
+    """
+    path = Path(path)
+    written = [draw_contact_sheet(path, out)]
+    folder = written[0].parent
+    files = _files(path)
+    if path.is_dir():
+        written.append(write_png(folder / TRAJECTORIES_NAME, trajectory_sheet(files)))
+    with TrajectoryReader(files[0]) as reader:
+        written.append(write_figure(folder / CAMERAS_NAME, draw_cameras(reader)))
+        positions, colors = merged_points(reader, reader.num_frames // 2)
+    write_ply(folder / POINTS_NAME, positions, colors)
+    return [
+        *written,
+        folder / POINTS_NAME,
+        write_figure(folder / POINTS_PICTURE_NAME, draw_points(positions, colors)),
+    ]
+
+
+def draw_contact_sheet(path: str | Path, out: Path | None = None) -> Path:
+    """Draw frames (down) by views (across) of the first trajectory, and the depth of view 0; return the PNG's path.
+
+    ``out`` is a folder or a ``.png`` path; by default the data set's own folder. The picture is overwritten.
+    """
+    path = Path(path)
+    target = out if out is not None else path.parent if path.is_file() else path
+    if target.suffix.lower() != ".png":
+        target = target / SHEET_NAME
+    return write_png(target, view_sheet(_files(path)[0]))
 
 
 def describe(path: str | Path) -> str:
@@ -30,7 +69,7 @@ def describe(path: str | Path) -> str:
             f"licence        {manifest.license}",
             f"data SHA-256   {manifest.digest}",
         ]
-        path = _first_file(path)
+        path = _files(path)[0]
     with TrajectoryReader(path) as reader:
         intrinsics, cam_to_world = reader.cameras([0])
         depth = reader.depth([0])
@@ -51,52 +90,13 @@ def describe(path: str | Path) -> str:
     return "\n".join(lines)
 
 
-def draw_contact_sheet(path: str | Path, out: Path | None = None) -> Path:
-    """Draw frames (down) by views (across) of the first trajectory, and the depth of view 0; return the PNG's path.
-
-    ``out`` is a folder or a ``.png`` path; by default the data set's own folder. The picture is overwritten.
-    """
-    import cv2
-
-    path = Path(path)
-    file = _first_file(path) if path.is_dir() else path
-    target = out if out is not None else file.parent if path.is_file() else path
-    if target.suffix.lower() != ".png":
-        target = target / SHEET_NAME
-    with TrajectoryReader(file) as reader:
-        times = np.unique(np.linspace(0, reader.num_frames - 1, _MAX_ROWS).round().astype(int))
-        views = np.arange(min(reader.num_views, _MAX_VIEWS))
-        rgb, depth = reader.rgb(times, views), reader.depth(times, [0])
-    scale = max(1, -(-_MIN_SIDE // min(rgb.shape[2:4])))
-    tiles = np.concatenate([rgb, color_depth(depth)], axis=1).repeat(scale, axis=2).repeat(scale, axis=3)
-    tiles = np.pad(tiles, ((0, 0), (0, 0), (0, _GAP), (0, _GAP), (0, 0)), constant_values=255)
-    rows, columns, height, width, _ = tiles.shape
-    sheet = tiles.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3)
-    is_encoded, encoded = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))
-    if not is_encoded:
-        raise DataError(f"The contact sheet of {file} cannot be encoded as PNG.")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with AtomicPath(target) as partial:
-        partial.write_bytes(encoded.tobytes())
-    return target
-
-
-def color_depth(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return depth as grey (..., 3) uint8: near is light, far is dark, black is not measured."""
-    valid = depth > 0
-    if not valid.any():
-        return np.zeros((*depth.shape, 3), np.uint8)
-    low, high = np.percentile(depth[valid], [1, 99])
-    share = np.clip((depth - low) / max(high - low, 1e-6), 0, 1)
-    grey = np.where(valid, 255 - 215 * share, 0).astype(np.uint8)
-    return np.repeat(grey[..., None], 3, axis=-1)
-
-
-def _first_file(folder: Path) -> Path:
-    for files in load_manifest(folder).splits.values():
-        if files:
-            return files[0]
-    raise DataError(f"{folder} has no trajectories.")
+def _files(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path]
+    files = [file for members in load_manifest(path).splits.values() for file in members]
+    if not files:
+        raise DataError(f"{path} has no trajectories.")
+    return files
 
 
 def _vector(values: tuple[float, float, float]) -> str:

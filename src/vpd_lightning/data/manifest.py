@@ -13,7 +13,8 @@ from vpd_lightning.errors import DataError
 FILE_NAME = "dataset.json"
 SPLITS = ("train", "validation", "test")
 _MAX_BYTES = 64 * 2**20
-_MAX_TRAJECTORIES = 1_000_000
+_MAX_TRAJECTORIES = 400_000
+_MAX_BRACKETS = _MAX_TRAJECTORIES + 10_000
 
 
 @dataclass(frozen=True)
@@ -94,15 +95,18 @@ def load_manifest(folder: str | Path) -> Manifest:
     if path.stat().st_size > _MAX_BYTES:
         raise DataError(f"{path} has {path.stat().st_size} bytes, more than the allowed {_MAX_BYTES}.")
     try:
-        content = json.loads(path.read_text())
-    except (ValueError, OSError) as error:
+        text = path.read_text()
+        if text.count("[") + text.count("{") > _MAX_BRACKETS:  # each would become an object of 56 bytes or more
+            raise ValueError(f"more than {_MAX_BRACKETS} lists and objects")
+        content = json.loads(text)
+    except (ValueError, OSError, RecursionError) as error:
         raise DataError(f"{path} cannot be read: {error}.\nRestore it, or generate the data set again.") from error
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != SCHEMA_VERSION:
         raise DataError(f"{path} has schema version {version!r}; this program reads version {SCHEMA_VERSION}.")
     try:
         return _parse(folder, content)
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise DataError(f"{path} is not a manifest: {type(error).__name__} {error}.") from error
 
 
@@ -128,6 +132,7 @@ def _parse(folder: Path, content: Mapping[str, Any]) -> Manifest:
     if len(sha256) > _MAX_TRAJECTORIES:
         raise DataError(f"{folder / FILE_NAME} names {len(sha256)} files, more than the allowed {_MAX_TRAJECTORIES}.")
     _check_files(folder, num_bytes)
+    _check_places(folder, sha256)
     return Manifest(
         folder=folder,
         name=str(content["name"]),
@@ -147,7 +152,10 @@ def _parse(folder: Path, content: Mapping[str, Any]) -> Manifest:
 def _inside(folder: Path, name: str) -> Path:
     """Refuse names that lead out of the data set: a manifest from elsewhere must not point at other files."""
     relative = PurePosixPath(name)
-    if relative.is_absolute() or ".." in relative.parts or "\\" in name or relative.suffix != ".h5":
+    is_plain = (
+        relative.as_posix() == name and not relative.is_absolute() and not {"..", "\\"} & {*relative.parts, *name}
+    )
+    if not is_plain or relative.suffix != ".h5":
         raise DataError(f"{folder / FILE_NAME} names {name!r}; only .h5 files inside the data set are allowed.")
     return folder / relative
 
@@ -167,6 +175,21 @@ def _check_files(folder: Path, num_bytes: Mapping[str, int]) -> None:
             f"Copy the data set again, or delete its {FILE_NAME} and damaged files and generate them again (the others "
             "are kept)."
         )
+
+
+def _check_places(folder: Path, names: Mapping[str, str]) -> None:
+    """Refuse symbolic links that leave the data set, or that bring one trajectory into two splits."""
+    home = folder.resolve()
+    seen: set[Path] = set()
+    for name in names:
+        place = (folder / name).resolve()
+        if not place.is_relative_to(home):
+            raise DataError(
+                f"{folder / name} is a symbolic link that leads out of the data set; copy the file instead."
+            )
+        if place in seen:
+            raise DataError(f"{folder / FILE_NAME} names a trajectory twice (by a symbolic link); splits must differ.")
+        seen.add(place)
 
 
 def _missing(folder: Path) -> str:

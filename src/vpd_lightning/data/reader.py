@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpd_lightning.data import schema
+from vpd_lightning.data.broken_file import refuse
 from vpd_lightning.data.camera_checks import check_intrinsics, check_poses
-from vpd_lightning.data.hdf5_checks import checked_attribute, checked_dataset, open_file, read_all, refuse
+from vpd_lightning.data.hdf5_checks import checked_attribute, checked_dataset, named_damage, open_file, read_all
+from vpd_lightning.data.image_chunks import ImageChunks
 
 MAX_IMAGE_SIDE = 16384
 MAX_FRAMES = 1_000_000
 MAX_VIEWS = 4096
+MAX_COORDINATE = 1e6  # metres
 
 Indices = Sequence[int] | NDArray[np.integer] | None
 
@@ -32,7 +35,7 @@ class TrajectoryReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._file: h5py.File | None = None
-        self._datasets: dict[str, h5py.Dataset] = {}
+        self._chunks: dict[str, ImageChunks] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {"path": self.path}  # handles must not cross a process border
@@ -50,7 +53,7 @@ class TrajectoryReader:
     def close(self) -> None:
         """Close the file; the next use opens it again."""
         if self._file is not None:
-            self._datasets = {}
+            self._chunks = {}
             self._file.close()
             self._file = None
 
@@ -111,8 +114,12 @@ class TrajectoryReader:
         depth = self._images(schema.DEPTH, times, views)
         if depth.dtype == np.uint16:
             attributes = self._attributes()
-            return schema.decode_depth(depth, attributes["scale"], attributes["offset"])
+            depth = schema.decode_depth(depth, attributes["scale"], attributes["offset"])
+        if not depth.size or (depth.min() >= 0 and depth.max() < np.inf):  # false for NaN; faster than looking at all
+            return depth
         depth[~np.isfinite(depth)] = 0.0
+        if (depth < 0).any():
+            raise refuse(self.path, "negative_depth", "'depth' has negative values; 0 means no measurement")
         return depth
 
     def cameras(self, times: Indices = None, views: Indices = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -136,15 +143,9 @@ class TrajectoryReader:
 
     def _images(self, name: str, times: Indices, views: Indices) -> NDArray[Any]:
         self._open()
-        dataset = self._datasets[name]
-        chosen_times = self._indices(times, dataset.shape[0], "frame")
-        chosen_views = self._indices(views, dataset.shape[1], "view")
-        images = np.empty((len(chosen_times), len(chosen_views), *dataset.shape[2:]), dataset.dtype)
-        time_runs, view_runs = _runs(chosen_times), _runs(chosen_views)
-        for time_out, time_in in time_runs:
-            for view_out, view_in in view_runs:
-                images[time_out, view_out] = read_all(self.path, dataset, (time_in, view_in))
-        return images
+        chosen_times = self._indices(times, self.num_frames, "frame")
+        chosen_views = self._indices(views, self.num_views, "view")
+        return self._chunks[name].read(chosen_times, chosen_views)
 
     def _indices(self, wanted: Indices, count: int, what: str) -> NDArray[np.int64]:
         if wanted is None:
@@ -154,6 +155,7 @@ class TrajectoryReader:
             worst = int(indices.max() if indices.max() >= count else indices.min())
             raise refuse(
                 self.path,
+                "not_that_many",
                 f"{what} {worst} was asked for; it has {count} {what}s (0 to {count - 1})",
                 f"Ask for fewer {what}s in the configuration, or use a data set that has them.",
             )
@@ -165,7 +167,8 @@ class TrajectoryReader:
         if self._file is None:
             file = open_file(self.path)
             try:
-                self._check(file)
+                with named_damage(self.path):
+                    self._check(file)
             except BaseException:
                 file.close()
                 raise
@@ -180,10 +183,16 @@ class TrajectoryReader:
         path = self.path
         version = checked_attribute(path, file, "schema_version", "integer")
         if version != schema.SCHEMA_VERSION:
-            raise refuse(path, f"has schema version {version}; this program reads version {schema.SCHEMA_VERSION}")
+            raise refuse(
+                path,
+                "schema_version",
+                f"has schema version {version}; this program reads version {schema.SCHEMA_VERSION}",
+            )
         depth_type = checked_attribute(path, file, "depth_type", "text")
         if depth_type != schema.DEPTH_TYPE:
-            raise refuse(path, f"has depth_type {depth_type!r}; depth must be 'z', along the optical axis")
+            raise refuse(
+                path, "depth_type", f"has depth_type {depth_type!r}; depth must be 'z', along the optical axis"
+            )
         values: dict[str, Any] = {}
         for key in ("frame_time", "near", "far"):
             values[key] = checked_attribute(path, file, key, "number")
@@ -191,29 +200,33 @@ class TrajectoryReader:
             values[key] = checked_attribute(path, file, key, "number", length=3)
         values["scene_hash"] = checked_attribute(path, file, "scene_hash", "text") if "scene_hash" in file.attrs else ""
         if values["frame_time"] <= 0:
-            raise refuse(path, f"has frame_time {values['frame_time']}; it must be positive (seconds)")
+            raise refuse(path, "frame_time", f"has frame_time {values['frame_time']}; it must be positive (seconds)")
         if not 0 <= values["near"] < values["far"]:
-            raise refuse(path, f"has near {values['near']} and far {values['far']}; 0 <= near < far is needed")
+            raise refuse(
+                path, "near_far", f"has near {values['near']} and far {values['far']}; 0 <= near < far is needed"
+            )
+        if not all(abs(value) <= MAX_COORDINATE for key in ("workspace_min", "workspace_max") for value in values[key]):
+            raise refuse(path, "workspace", f"has a workspace beyond {MAX_COORDINATE:g} m")
         if not all(low < high for low, high in zip(values["workspace_min"], values["workspace_max"], strict=True)):
-            raise refuse(path, "has an empty workspace (workspace_min is not below workspace_max)")
+            raise refuse(path, "workspace", "has an empty workspace (workspace_min is not below workspace_max)")
 
         rgb = checked_dataset(path, file, schema.RGB, dtypes=[np.uint8], num_axes=[5])
         depth = checked_dataset(path, file, schema.DEPTH, dtypes=[np.float32, np.uint16], num_axes=[4])
         time, view, height, width, channels = rgb.shape
         if channels != 3:
-            raise refuse(path, f"'rgb' has {channels} channels; it must have 3")
+            raise refuse(path, "wrong_shape", f"'rgb' has {channels} channels; it must have 3")
         if depth.shape != rgb.shape[:4]:
-            raise refuse(path, f"'depth' has shape {depth.shape}; 'rgb' has {rgb.shape}")
+            raise refuse(path, "wrong_shape", f"'depth' has shape {depth.shape}; 'rgb' has {rgb.shape}")
         if time > MAX_FRAMES or view > MAX_VIEWS or max(height, width) > MAX_IMAGE_SIDE:
             limit = f"{MAX_FRAMES} frames, {MAX_VIEWS} views, {MAX_IMAGE_SIDE} pixels"
-            raise refuse(path, f"'rgb' has shape {rgb.shape}, over the limits ({limit})")
+            raise refuse(path, "absurd_size", f"'rgb' has shape {rgb.shape}, over the limits ({limit})")
         if depth.dtype == np.uint16:
             for key in ("scale", "offset"):
                 values[key] = checked_attribute(path, depth, key, "number")
             if values["scale"] <= 0:
-                raise refuse(path, f"'depth' has scale {values['scale']}; it must be positive")
+                raise refuse(path, "depth_scale", f"'depth' has scale {values['scale']}; it must be positive")
         self._values = {**values, "shape": (time, view, height, width)}
-        self._datasets = {schema.RGB: rgb, schema.DEPTH: depth}
+        self._chunks = {schema.RGB: ImageChunks(path, rgb), schema.DEPTH: ImageChunks(path, depth)}
         self._cameras = (
             check_intrinsics(path, self._read_matrices(file, schema.INTRINSICS, time, view, 3), height, width),
             check_poses(path, self._read_matrices(file, schema.CAM_TO_WORLD, time, view, 4)),
@@ -223,20 +236,10 @@ class TrajectoryReader:
         dataset = checked_dataset(self.path, file, name, dtypes=[np.float64], num_axes=[3, 4])
         shapes = [(view, size, size), (time, view, size, size)]
         if dataset.shape not in shapes:
-            raise refuse(self.path, f"{name!r} has shape {dataset.shape}; it must be {shapes[0]} or {shapes[1]}")
+            raise refuse(
+                self.path, "wrong_shape", f"{name!r} has shape {dataset.shape}; it must be {shapes[0]} or {shapes[1]}"
+            )
         return read_all(self.path, dataset)
-
-
-def _runs(indices: NDArray[np.int64]) -> list[tuple[slice, slice]]:
-    """Split indices into rising runs: pairs (where in the result, where in the file), so that HDF5 reads slices."""
-    if not len(indices):
-        return []
-    starts = np.flatnonzero(np.diff(indices, prepend=indices[0] - 2) != 1)
-    ends = np.append(starts[1:], len(indices))
-    return [
-        (slice(int(a), int(b)), slice(int(indices[a]), int(indices[b - 1]) + 1))
-        for a, b in zip(starts, ends, strict=True)
-    ]
 
 
 class ReaderCache:

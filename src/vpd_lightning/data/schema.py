@@ -32,7 +32,13 @@ STATE_LINEAR_VELOCITIES = "linear_velocities"  # (time, object, 3) m/s, world, o
 STATE_ANGULAR_VELOCITIES = "angular_velocities"  # (time, object, 3) rad/s, world
 STATE_HALF_SIZES = "half_sizes"  # (object, 3) m, along the body's own axes
 STATE_SEGMENTATION = "segmentation"  # (time, view, height, width) uint8, 0 background, i + 1 object i
-COMPRESSIONS = ("lzf", "gzip", "none")
+STATE_VERTICES = "vertices"  # (time, vertex, 3) float32 m, world: soft bodies, all of them one after another
+STATE_VERTEX_OBJECTS = "vertex_objects"  # (vertex,) int32, the object each vertex belongs to
+STATE_TETRAHEDRA = "tetrahedra"  # (element, 4) int32, indices into vertices
+# gzip is the default because the same pictures give the same bytes. HDF5's lzf does not: its dictionary starts with
+# whatever its memory held before. Both read equally fast.
+COMPRESSIONS = ("gzip", "lzf", "none")
+_GZIP_LEVEL = 1  # level 4 takes 1.5 times as long to write and saves a sixth
 DEPTH_ENCODINGS = ("float32", "uint16")
 PARTIAL_SUFFIX = ".partial"
 _UINT16_STEPS = 65534  # 0 means no measurement, 1..65535 cover [near, far of the data]
@@ -73,7 +79,7 @@ def _require(name: str, array: NDArray[Any], dtype: type, shapes: list[tuple[int
 
 
 def write_trajectory(
-    path: Path, trajectory: Trajectory, *, compression: str = "lzf", depth_encoding: str = "float32"
+    path: Path, trajectory: Trajectory, *, compression: str = "gzip", depth_encoding: str = "float32"
 ) -> None:
     """Write one file so that ``path`` either does not exist or is complete, even after a power cut.
 
@@ -141,6 +147,7 @@ def _write_images(group: h5py.Group, name: str, images: NDArray[Any], compressio
         data=images,
         chunks=(1, 1, *images.shape[2:]),
         compression=None if compression == "none" else compression,
+        compression_opts=_GZIP_LEVEL if compression == "gzip" else None,
         shuffle=images.dtype.itemsize > 1,
         fletcher32=True,
     )

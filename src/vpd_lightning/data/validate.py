@@ -1,11 +1,10 @@
 """Checking a data set: every file on its own, and whether depths and poses of different views agree.
 
-The cross-view check unprojects the depth of one view, looks the points up in another, and compares distances. Wrong
-conventions show at once; where another reading of axes or depth fits much better, the fault says which.
+What cannot be right is a fault; what a person should know, such as that the views cannot tell two conventions apart, is
+a remark. See ``view_agreement`` and ``free_space`` for what is compared between views.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -13,41 +12,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpd_lightning.data import schema
+from vpd_lightning.data.broken_file import BrokenFileError
+from vpd_lightning.data.fault import Fault
+from vpd_lightning.data.free_space import MAX_SHARE, FreeSpace, free_space_violations
 from vpd_lightning.data.hdf5_checks import open_file
 from vpd_lightning.data.manifest import FILE_NAME, file_sha256, load_manifest
 from vpd_lightning.data.reader import TrajectoryReader
+from vpd_lightning.data.readings import STORED, Reading, single_mistakes
+from vpd_lightning.data.shots import Shot
+from vpd_lightning.data.view_agreement import MAX_PAIRS, Agreement, compare_views
 from vpd_lightning.errors import DataError
 
 MAX_RELATIVE_DISTANCE = 0.02  # of the depth: between correct sensors, after leaving out occlusions
-_MUCH_BETTER = 0.5  # another convention is named when it reduces the distance below this share
-_MIN_OVERLAP = 50  # pixels that two views must share to be compared
-_MAX_PAIRS = 12
 _MAX_FILES_COMPARED = 4
-_MAX_PIXELS = 20_000
-
-Array = NDArray[np.float64]
+_MIN_PAIRS = 4  # of images, per file
+_NOISY = 1e-3  # of the depth: beyond this it is noise, not the views, that hides small differences
+_PER_FRAME_STATE = (
+    schema.STATE_POSITIONS,
+    schema.STATE_QUATERNIONS,
+    schema.STATE_LINEAR_VELOCITIES,
+    schema.STATE_ANGULAR_VELOCITIES,
+    schema.STATE_SEGMENTATION,
+    "vertices",
+)
 
 
 @dataclass(frozen=True)
-class Fault:
-    """One thing that is wrong; ``is_error`` is false for a remark."""
+class Report:
+    """All faults and remarks, and one line about what was compared."""
 
-    name: str
-    file: str
-    message: str
-    is_error: bool = True
+    faults: list[Fault]
+    summary: str
 
-    def __str__(self) -> str:
-        kind = "fault" if self.is_error else "remark"
-        return f"{kind} {self.name}: {self.file}: {self.message}"
+    @property
+    def is_valid(self) -> bool:
+        """Whether there are at most remarks."""
+        return not any(fault.is_error for fault in self.faults)
+
+
+@dataclass(frozen=True)
+class _Views:
+    """What comparing the views of one file gave; None where nothing could be compared."""
+
+    faults: list[Fault]
+    agreement: Agreement | None
+    free_space: FreeSpace
 
 
 def validate_dataset(path: str | Path) -> list[Fault]:
-    """Check a data set folder or one ``.h5`` file and return all faults; an empty list means none."""
+    """Check a data set folder or one ``.h5`` file and return all faults and remarks; an empty list means none."""
+    return check_dataset(path).faults
+
+
+def summary(path: str | Path) -> str:
+    """Return one line: how far apart views place the same surface, and the share of free-space violations."""
+    return check_dataset(path).summary
+
+
+def check_dataset(path: str | Path) -> Report:
+    """Check a data set folder or one ``.h5`` file: everything ``vpd-data validate`` says."""
     path = Path(path)
     if path.is_file():
-        return validate_trajectory(path) + validate_views(path)
-    faults: list[Fault] = []
+        faults = validate_trajectory(path)
+        compared = [_check_views(path)] if _is_comparable(faults) else []
+        return Report([*faults, *(fault for item in compared for fault in item.faults)], _summary(path, compared))
+    faults = []
     try:
         manifest = load_manifest(path)
         files = [file for members in manifest.splits.values() for file in members]
@@ -55,24 +84,28 @@ def validate_dataset(path: str | Path) -> list[Fault]:
         faults.append(Fault("manifest", FILE_NAME, _one_line(error)))
         manifest, files = None, sorted(path.glob("*/*.h5")) + sorted(path.glob("*.h5"))
         if not files:
-            return faults
+            return Report(faults, _summary(path, []))
     shapes: dict[tuple[int, ...], Path] = {}
-    healthy = []
+    comparable = []
     for file in files:
         found = validate_trajectory(file)
         if manifest is not None and file_sha256(file) != manifest.sha256[manifest.relative(file)]:
             found.append(Fault("checksum", str(file), f"its SHA-256 differs from {FILE_NAME}"))
         faults += found
-        if not found:
-            healthy.append(file)
+        if _is_comparable(found):
+            comparable.append(file)
             with TrajectoryReader(file) as reader:
                 shapes.setdefault((reader.num_views, reader.height, reader.width), file)
     if len(shapes) > 1:
         listed = "; ".join(f"{shape} in {file.name}" for shape, file in shapes.items())
         faults.append(Fault("mixed_shapes", str(path), f"(views, height, width) differ between files: {listed}"))
-    for file in healthy[:: max(1, len(healthy) // _MAX_FILES_COMPARED)][:_MAX_FILES_COMPARED]:
-        faults += validate_views(file)
-    return faults
+    stride = max(1, len(comparable) // _MAX_FILES_COMPARED)
+    chosen = comparable[::stride][:_MAX_FILES_COMPARED]
+    compared = [_check_views(file, max(_MIN_PAIRS, MAX_PAIRS // len(chosen))) for file in chosen]
+    for item in compared:
+        said = {(fault.name, fault.message) for fault in faults if not fault.is_error}
+        faults += [fault for fault in item.faults if fault.is_error or (fault.name, fault.message) not in said]
+    return Report(faults, _summary(path, compared))
 
 
 def validate_trajectory(path: Path) -> list[Fault]:
@@ -80,145 +113,142 @@ def validate_trajectory(path: Path) -> list[Fault]:
     try:
         with TrajectoryReader(path) as reader:
             faults = []
-            num_measured, num_inside, num_nan = 0, 0, 0
+            is_measured, is_inside = False, False
             for time in range(reader.num_frames):
                 reader.rgb([time])
                 depth = reader.depth([time])
-                if (depth < 0).any():
-                    faults.append(Fault("negative_depth", str(path), f"frame {time} has negative depths"))
-                    break
-                num_measured += int((depth > 0).sum())
-                num_nan += depth.size
-                num_inside += _count_inside(reader, time, depth)
+                is_measured = is_measured or bool((depth > 0).any())
+                is_inside = is_inside or _inside_share(_shots(reader, time, depth), STORED, reader) > 0
+            if is_measured and not is_inside:
+                faults.append(Fault("empty_workspace", str(path), _empty_workspace(reader)))
             faults += _check_state(path, reader)
     except DataError as error:
-        return [Fault("unreadable", str(path), _one_line(error, str(path)))]
-    if num_measured == 0:
+        kind = error.kind if isinstance(error, BrokenFileError) else "unreadable"
+        return [Fault(kind, str(path), _one_line(error, str(path)))]
+    if not is_measured:
         faults.append(Fault("no_depth", str(path), "not one pixel has a depth"))
-    elif num_inside == 0:
-        faults.append(
-            Fault(
-                "empty_workspace",
-                str(path),
-                "not one measured pixel lies in the workspace "
-                "(are depth in metres, cam_to_world and workspace_min/max in one frame?)",
-            )
-        )
     return faults
 
 
-def validate_views(path: Path, time: int = 0) -> list[Fault]:
-    """Compare the views of one frame; see the module's text. Fewer than two views: nothing to compare."""
-    errors = convention_errors(path, time)
-    if not errors:
-        return []
-    used = errors["as stored"]
-    best_name, best = min(errors.items(), key=lambda item: item[1])
-    if used <= MAX_RELATIVE_DISTANCE:
-        return []
-    hint = f"; it would be {best:.2%} if {best_name}" if best < _MUCH_BETTER * used else ""
-    return [
-        Fault(
-            "views_disagree",
-            str(path),
-            f"frame {time}: points seen by two views are {used:.2%} of their "
-            f"distance apart (median; allowed {MAX_RELATIVE_DISTANCE:.0%}){hint}",
-        )
-    ]
+def validate_views(path: Path) -> list[Fault]:
+    """Compare the views of a few frames; with one moving camera, the same camera at different times."""
+    return _check_views(path).faults
 
 
-def convention_errors(path: Path, time: int = 0) -> dict[str, float]:
+def convention_errors(path: Path) -> dict[str, float]:
     """Return, per reading of the conventions, the median distance between views relative to depth.
 
-    ``as stored`` is the reading the format prescribes. Empty when the views share too few pixels. Occluded points are
-    left out by taking, per pair, the better half of the distances: the same rule for every reading.
+    ``as stored`` is the reading the format prescribes. Empty where there is no second look at anything.
     """
     with TrajectoryReader(path) as reader:
-        if reader.num_views < 2:
-            return {}
-        depth = reader.depth([time])[0].astype(np.float64)
-        intrinsics, cam_to_world = (array[0] for array in reader.cameras([time]))
-    errors = {}
-    for name, reading in _readings().items():
-        distances = list(_pair_distances(*reading(depth, intrinsics, cam_to_world)))
-        if distances:
-            errors[name] = float(np.median(distances))
-        elif name != "as stored":
-            continue
-        else:
-            errors[name] = float("inf")
-    return errors if np.isfinite(list(errors.values())).any() else {}
+        agreement = compare_views(reader)
+    return agreement.errors if agreement is not None else {}
 
 
-def _readings() -> dict[str, Callable[[Array, Array, Array], tuple[Array, Array, Array]]]:
-    """Other conventions that people use, as conversions to ours."""
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    return {
-        "as stored": lambda d, k, p: (d, k, p),
-        "the camera axes are OpenGL's (y up, z back): multiply cam_to_world by diag(1, -1, -1, 1)": lambda d, k, p: (
-            d,
-            k,
-            p @ flip,
-        ),
-        "cam_to_world is world_to_cam: invert it": lambda d, k, p: (d, k, np.linalg.inv(p)),
-        "cam_to_world is world_to_cam with OpenGL axes: invert it, then multiply by diag(1, -1, -1, 1)": (
-            lambda d, k, p: (d, k, np.linalg.inv(p) @ flip)
-        ),
-        "depth is the distance to the camera centre: divide it by the length of the ray": lambda d, k, p: (
-            d / _ray_lengths(d, k),
-            k,
-            p,
-        ),
-        "depth is the distance to the camera centre and the axes are OpenGL's": lambda d, k, p: (
-            d / _ray_lengths(d, k),
-            k,
-            p @ flip,
-        ),
-        "depth is in millimetres: divide it by 1000": lambda d, k, p: (d / 1000.0, k, p),
-    }
+def _is_comparable(faults: list[Fault]) -> bool:
+    """Whether a file can be read and has depth, so that its views can be compared."""
+    return all(fault.name in ("empty_workspace", "state_length") for fault in faults)
 
 
-def _ray_lengths(depth: Array, intrinsics: Array) -> Array:
-    return np.stack([np.linalg.norm(_rays(depth.shape[1:], matrix), axis=-1) for matrix in intrinsics])
+def _check_views(path: Path, max_pairs: int = MAX_PAIRS) -> _Views:
+    with TrajectoryReader(path) as reader:
+        agreement = compare_views(reader, max_pairs)
+    free_space = free_space_violations(path)
+    faults = [Fault("cannot_tell", str(path), _STATIC_VIEW, is_error=False)]
+    if agreement is not None:
+        faults = _judge(path, agreement)
+    if not any(fault.is_error for fault in faults) and free_space.share > MAX_SHARE:
+        faults.append(_judge_free_space(path, free_space))
+    return _Views(faults, agreement, free_space)
 
 
-def _rays(shape: tuple[int, ...], matrix: Array) -> Array:
-    """Rays (height, width, 3) in the camera, one unit along the optical axis; pixel centres at +0.5."""
-    v, u = np.meshgrid(np.arange(shape[0]) + 0.5, np.arange(shape[1]) + 0.5, indexing="ij")
-    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
-    return pixels @ np.linalg.inv(matrix).T
+_STATIC_VIEW = (
+    "one camera that stands still sees every point once: nothing here can tell whether depth and poses follow the "
+    "conventions (a second view or a moving camera can)"
+)
 
 
-def _pair_distances(depth: Array, intrinsics: Array, cam_to_world: Array) -> Iterator[float]:
-    num_views, height, width = depth.shape
-    pairs = [(a, b) for a in range(num_views) for b in range(num_views) if a != b]
-    for first, second in pairs[:: max(1, len(pairs) // _MAX_PAIRS)][:_MAX_PAIRS]:
-        pose = cam_to_world[first]
-        points = (_rays((height, width), intrinsics[first]) * depth[first][..., None])[depth[first] > 0]
-        points = points[:: max(1, len(points) // _MAX_PIXELS)] @ pose[:3, :3].T + pose[:3, 3]
-        inverse = np.linalg.inv(cam_to_world[second])
-        seen = points @ inverse[:3, :3].T + inverse[:3, 3]
-        seen = seen[seen[:, 2] > 1e-6]
-        pixels = seen @ intrinsics[second].T
-        column, row = np.floor(pixels[:, :2] / pixels[:, 2:]).T
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        measured = depth[second][row[inside].astype(int), column[inside].astype(int)]
-        expected = seen[inside, 2]
-        valid = measured > 0
-        if valid.sum() >= _MIN_OVERLAP:
-            relative = np.abs(measured[valid] - expected[valid]) / expected[valid]
-            yield float(np.quantile(relative, 0.25))  # the median of the better half
+def _judge(path: Path, agreement: Agreement) -> list[Fault]:
+    """What the comparison of views means."""
+    apart = f"points seen twice are {_percent(agreement.distance)} of their depth apart (median"
+    if agreement.explanation is not None:
+        better = f"it would be {_percent(agreement.explained_distance)} if {agreement.explanation}"
+        shared = f"{apart})" if np.isfinite(agreement.distance) else "the images share no points as they are stored"
+        return [Fault("views_disagree", str(path), f"{shared}; {better}")]
+    if not np.isfinite(agreement.distance):
+        message = "no two images share enough measured points: nothing tells whether depth and poses agree"
+        return [Fault("cannot_tell", str(path), message, is_error=False)]
+    if agreement.distance > MAX_RELATIVE_DISTANCE:
+        apart += f"; allowed {MAX_RELATIVE_DISTANCE:.0%}), and no other convention explains it"
+        if agreement.is_over_time:  # then the scene itself may have moved
+            message = f"{apart}; compared was each camera with itself at other times: does the whole scene move?"
+            return [Fault("views_disagree", str(path), message, is_error=False)]
+        return [Fault("views_disagree", str(path), f"{apart}: are the cameras calibrated, and do their times agree?")]
+    if agreement.undecidable:
+        listed = " | ".join(str(reading).split(":")[0] for reading in agreement.undecidable)
+        is_noise = agreement.distance > _NOISY
+        reason = "the depth's noise hides" if is_noise else "views too alike, or surfaces too flat, to tell"
+        message = f"{reason} whether: {listed}"
+        return [Fault("cannot_tell", str(path), message, is_error=False)]
+    return []
 
 
-def _count_inside(reader: TrajectoryReader, time: int, depth: NDArray[np.float32]) -> int:
+def _judge_free_space(path: Path, free_space: FreeSpace) -> Fault:
+    message = (
+        f"{free_space.share:.1%} of {free_space.num_points} points lie in front of what another view sees there "
+        f"(allowed {MAX_SHARE:.0%})"
+    )
+    if free_space.share_beyond_noise <= MAX_SHARE:
+        noise = f"; the depth's noise of {_percent(free_space.noise)} explains it"
+        return Fault("free_space", str(path), message + noise, is_error=False)
+    first, second = max(free_space.pairs, key=free_space.pairs.__getitem__)
+    worst = f"; most are points of view {first} seen from view {second} ({free_space.pairs[first, second]:.1%})"
+    return Fault("free_space", str(path), message + worst)
+
+
+def _summary(path: Path, compared: list[_Views]) -> str:
+    agreements = [item.agreement for item in compared if item.agreement is not None]
+    distances = [agreement.distance for agreement in agreements if np.isfinite(agreement.distance)]
+    parts = ["no views compared"]
+    if distances:
+        num_pairs = sum(agreement.num_pairs for agreement in agreements)
+        parts = [f"median cross-view distance {_percent(float(np.median(distances)))} of the depth ({num_pairs} pairs)"]
+    num_points = sum(item.free_space.num_points for item in compared)
+    if num_points:
+        share = sum(item.free_space.share * item.free_space.num_points for item in compared) / num_points
+        parts.append(f"free-space violations {_percent(share)} of {num_points} points")
+    return f"{path}: {len(compared)} {'file' if len(compared) == 1 else 'files'} compared, " + ", ".join(parts)
+
+
+def _shots(reader: TrajectoryReader, time: int, depth: NDArray[np.float32]) -> list[Shot]:
     intrinsics, cam_to_world = (array[0] for array in reader.cameras([time]))
-    count = 0
-    for view in range(depth.shape[1]):
-        image = depth[0, view].astype(np.float64)
-        points = (_rays(image.shape, intrinsics[view]) * image[..., None])[image > 0]
-        points = points @ cam_to_world[view, :3, :3].T + cam_to_world[view, :3, 3]
-        count += int(((points >= reader.workspace_min) & (points <= reader.workspace_max)).all(axis=-1).sum())
-    return count
+    return [Shot(*parts) for parts in zip(depth[0], intrinsics, cam_to_world, strict=True)]
+
+
+def _inside_share(shots: list[Shot], reading: Reading, reader: TrajectoryReader) -> float:
+    """Share of the measured points that lie in the workspace; 0 where they all lie in one tiny part of it."""
+    points = np.concatenate([(shot if reading == STORED else reading.read(shot)).points() for shot in shots])
+    low, high = np.array(reader.workspace_min), np.array(reader.workspace_max)
+    is_inside = ((points >= low) & (points <= high)).all(axis=-1)
+    if not is_inside.any() or (
+        reading != STORED and np.ptp(points[is_inside], axis=0).max() < 0.1 * (high - low).max()
+    ):
+        return 0.0
+    return float(is_inside.mean())
+
+
+def _empty_workspace(reader: TrajectoryReader) -> str:
+    """Say that no point is inside, and which reading of poses and depth would bring some there."""
+    shots = _shots(reader, 0, reader.depth([0]))
+    readings = [reading for reading in single_mistakes() if not reading.pixel_shift and not reading.ray_power]
+    readings += [Reading(depth_scale=1e-3, translation_scale=1e-3)]
+    readings += [replace(reading, axes="opengl") for reading in readings if reading.axes == "opencv"]
+    shares = {reading: round(_inside_share(shots, reading, reader), 1) for reading in readings}
+    best = max(readings, key=shares.__getitem__)  # the first, simplest one of equals
+    message = "not one measured pixel lies in the workspace "
+    if shares[best]:
+        return f"{message}({shares[best]:.0%} would if {best})"
+    return f"{message}(are depth in metres, cam_to_world and workspace_min/max in one frame?)"
 
 
 def _check_state(path: Path, reader: TrajectoryReader) -> list[Fault]:
@@ -227,9 +257,17 @@ def _check_state(path: Path, reader: TrajectoryReader) -> list[Fault]:
         group = file.get(schema.STATE)
         if not isinstance(group, h5py.Group):
             return []
-        names = (schema.STATE_POSITIONS, schema.STATE_QUATERNIONS, schema.STATE_SEGMENTATION)
-        wrong = [name for name in names if name in group and group[name].shape[0] != reader.num_frames]
+        wrong = [
+            name
+            for name in _PER_FRAME_STATE
+            if name in group
+            and not (isinstance(group[name], h5py.Dataset) and group[name].shape[:1] == (reader.num_frames,))
+        ]
     return [Fault("state_length", str(path), f"state/{name} has not one entry per frame") for name in wrong]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
 
 
 def _one_line(error: BaseException, prefix: str = "") -> str:

@@ -1,0 +1,117 @@
+import zlib
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from vpd_lightning.data.image_chunks import ImageChunks
+from vpd_lightning.data.lzf_numba import SLACK, fletcher32, unpack_lzf
+from vpd_lightning.errors import DataError
+
+SHAPE = (3, 2, 24, 20)
+
+
+def pictures(kind: str, dtype: Any) -> np.ndarray:
+    """Pictures that pack badly, well, and in runs of every length."""
+    draw = np.random.default_rng(3)
+    if kind == "noise":
+        return draw.integers(0, 250, size=SHAPE).astype(dtype)
+    if kind == "flat":
+        return np.full(SHAPE, 7, dtype)
+    steps = draw.integers(1, 40, size=400).cumsum() % 17
+    return np.resize(np.repeat(steps, draw.integers(1, 90, size=400)), SHAPE).astype(dtype)
+
+
+@pytest.mark.parametrize("kind", ["noise", "flat", "runs"])
+@pytest.mark.parametrize("dtype", ["u1", "<u2", "<f4"])
+@pytest.mark.parametrize("options", [{"compression": "gzip"}, {"compression": "lzf"}, {}])
+@pytest.mark.parametrize("chunks", [(1, 1, 24, 20), (2, 2, 10, 20)])
+@pytest.mark.parametrize("extra", [{}, {"shuffle": True, "fletcher32": True}])
+def test_images_equal_what_hdf5_reads(
+    tmp_path: Path, kind: str, dtype: str, options: dict[str, Any], chunks: tuple[int, ...], extra: dict[str, Any]
+):
+    expected = pictures(kind, dtype)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        chunked = ImageChunks(
+            tmp_path / "a.h5", file.create_dataset("x", data=expected, chunks=chunks, **options, **extra)
+        )
+        for times, views in (([0, 1, 2], [0, 1]), ([2, 0], [1]), ([], [0])):
+            found = chunked.read(np.array(times, int), np.array(views, int))
+
+            assert found.dtype == expected.dtype
+            np.testing.assert_array_equal(found, expected[np.ix_(times, views)])
+
+
+def test_large_windows_are_unpacked_on_several_threads(tmp_path: Path):
+    """1.5 MB, above the size from which a second thread pays; the order of images must not depend on it."""
+    images = np.random.default_rng(0).integers(0, 3, size=(16, 2, 128, 128, 3)).astype(np.uint8)
+    for compression in ("gzip", "lzf"):
+        with h5py.File(tmp_path / f"{compression}.h5", "w") as file:
+            dataset = file.create_dataset("x", data=images, chunks=(1, 1, 128, 128, 3), compression=compression)
+            read = ImageChunks(tmp_path / "a.h5", dataset).read(np.arange(16), np.arange(2))
+        np.testing.assert_array_equal(read, images)
+
+
+def lzf_bomb(num_bytes: int) -> bytes:
+    """One zero, and as often as needed: 264 times the byte before."""
+    return b"\x00\x00" + b"\xe0\xff\x00" * (num_bytes // 264)
+
+
+@pytest.mark.parametrize(
+    ("compression", "content"),
+    [
+        ("gzip", zlib.compress(bytes(10_000))),
+        ("gzip", zlib.compress(bytes(479))),
+        ("gzip", zlib.compress(bytes(480))[:-1]),
+        ("gzip", b"\x78\x9c"),
+        ("lzf", lzf_bomb(10_000)),
+        ("lzf", lzf_bomb(300)),
+        ("lzf", b"\x20\x05"),  # a copy of what was five bytes before the start
+        ("lzf", b"\x1f"),  # 32 bytes that are not there
+        ("lzf", b"\xe0"),
+    ],
+)
+@pytest.mark.parametrize("mask", [0, 2])
+def test_chunk_that_is_not_one_image_is_refused(tmp_path: Path, compression: str, content: bytes, mask: int):
+    """``mask`` 2 claims that the checksum was left out."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        dataset = file.create_dataset(
+            "x", data=np.zeros(SHAPE, np.uint8), chunks=(1, 1, 24, 20), compression=compression, fletcher32=bool(mask)
+        )
+        dataset.id.write_direct_chunk((0, 0, 0, 0), content, mask)
+        with pytest.raises(DataError, match=r"a\.h5: '/x'"):
+            ImageChunks(tmp_path / "a.h5", dataset).read(np.array([0]), np.array([0]))
+
+
+def test_image_that_was_stored_unpacked_is_read(tmp_path: Path):
+    expected = np.random.default_rng(0).integers(0, 256, size=SHAPE).astype(np.uint8)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        dataset = file.create_dataset("x", SHAPE, np.uint8, chunks=(1, 1, 24, 20), compression="gzip")
+        for place in np.ndindex(SHAPE[:2]):
+            dataset.id.write_direct_chunk((*place, 0, 0), expected[place].tobytes(), 1)
+        np.testing.assert_array_equal(
+            ImageChunks(tmp_path / "a.h5", dataset).read(np.arange(3), np.arange(2)), expected
+        )
+
+
+def test_nothing_is_written_beyond_the_slack():
+    """Random bytes as lzf: whatever they say, the guard behind the slack stays as it was."""
+    draw = np.random.default_rng(0)
+    for _ in range(300):
+        source = draw.integers(0, 256, size=200 + SLACK).astype(np.uint8)
+        target = np.full(480 + SLACK + 8, 77, np.uint8)
+        assert unpack_lzf(source, 200, target, 480) <= 480
+        assert (target[480 + 8 :] == 77).all()
+
+
+def test_checksum_is_that_of_a_plain_loop():
+    for num_bytes in (0, 1, 2, 15, 50_001):
+        content = np.random.default_rng(num_bytes).integers(0, 256, size=num_bytes).astype(np.uint8)
+        first = second = 0
+        padded = content.tolist() + [0] * (num_bytes % 2)
+        for high, low in zip(padded[::2], padded[1::2], strict=True):
+            first = (first + 256 * high + low) % 65_535
+            second = (second + first) % 65_535
+        assert fletcher32(content, num_bytes) == second << 16 | first
