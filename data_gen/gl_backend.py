@@ -46,7 +46,7 @@ def choose_backend(renderer: str) -> str:
         f"No GL rendering on this machine ({'; '.join(reasons)}).\n"
         "Install EGL:    apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0 libgl1\n"
         "or OSMesa:      apt-get install libosmesa6\n"
-        "or do without:  renderer=raycast needs no GL (same physics and depth, simpler shading)."
+        "or do without:  scene=mujoco_block renderer=raycast needs no GL (same physics and depth, simpler shading)."
     )
 
 

@@ -25,7 +25,7 @@ def run_jobs(
     environment: Mapping[str, str],
     num_workers: int,
     advance: Callable[[], None],
-) -> dict[Path, str]:
+) -> dict[Path, worker.MadeFile]:
     """Run ``worker.make_file(*jobs[path])`` for every path and return what each returned.
 
     ``environment`` is what workers find before they import anything. ``advance`` is called after each job.
@@ -35,13 +35,13 @@ def run_jobs(
     """
     context = get_context("spawn")  # GL contexts and HDF5 do not survive a fork
     stop = context.Event()
-    results: dict[Path, str] = {}
+    results: dict[Path, worker.MadeFile] = {}
     with deferred_signals() as received, _environment(environment):
         pool = ProcessPoolExecutor(
             num_workers, mp_context=context, initializer=worker.start, initargs=(*initializer_arguments, stop)
         )
         try:
-            remaining, running = iter(jobs.items()), dict[Future[str], Path]()
+            remaining, running = iter(jobs.items()), dict[Future[worker.MadeFile], Path]()
             while not received:
                 with _blocked_signals():  # submitting starts workers, which inherit the mask and lift it themselves
                     while len(running) < _JOBS_AHEAD * num_workers and (job := next(remaining, None)) is not None:
@@ -63,6 +63,11 @@ def run_jobs(
     if len(results) < len(jobs):  # a signal whose own handler returned
         raise KeyboardInterrupt
     return results
+
+
+def num_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager

@@ -12,6 +12,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from vpd_lightning.errors import ConfigError
 
+_MAX_EXTENDS = 8
+SPLIT_CODES = {"train": 0, "validation": 1, "test": 2}  # what a split adds to a trajectory's seed
+
 Settings = TypeVar("Settings")
 
 
@@ -49,16 +52,47 @@ def did_you_mean(value: str, choices: Iterable[str]) -> str:
     return f"; did you mean {near[0]!r}?" if near else "."
 
 
+def load_preset(scene: str, preset: str) -> tuple[str, DictConfig]:
+    """Return a preset's family (the package in ``data_gen`` that makes it) and its values.
+
+    ``extends: SCENE/PRESET`` in a preset names another whose values (and family) hold where it says nothing. Without
+    ``family`` a scene is its own.
+    """
+    require_choice("scene", scene, scene_names())
+    require_choice("preset", preset, preset_names(scene))
+    chain: list[DictConfig] = []
+    name = f"{scene}/{preset}"
+    while name:
+        path = preset_folder() / f"{name}.yaml"
+        if len(chain) > _MAX_EXTENDS or not path.is_file():
+            raise ConfigError(f"Preset {scene}/{preset} extends {name}, which is missing or extends it in turn.")
+        values = OmegaConf.load(path)
+        assert isinstance(values, DictConfig)
+        chain.append(values)
+        name = values.pop("extends", "")
+    merged = OmegaConf.merge(*reversed(chain))
+    assert isinstance(merged, DictConfig)
+    return merged.pop("family", scene), merged
+
+
 def load_settings(schema: type[Settings], scene: str, preset: str, overrides: Mapping[str, Any]) -> Settings:
     """Read a preset, apply overrides (nested, or with dotted keys) and check names, types and ranges.
 
     Raises:
         ConfigError: unknown scene, preset or key (with the nearest name), a value of the wrong type or out of range.
     """
-    require_choice("scene", scene, scene_names())
-    require_choice("preset", preset, preset_names(scene))
-    base = OmegaConf.load(preset_folder() / scene / f"{preset}.yaml")
-    assert isinstance(base, DictConfig)
+    _, base = load_preset(scene, preset)
+    return checked_settings(schema, base, overrides, f"scene {scene}, preset {preset}")
+
+
+def checked_settings(schema: type[Settings], base: DictConfig, overrides: Mapping[str, Any], where: str) -> Settings:
+    """Merge overrides (nested, or with dotted keys) into ``base`` and check names, types and ranges by ``schema``.
+
+    ``where`` says in messages which settings these are.
+
+    Raises:
+        ConfigError: an unknown key (with the nearest name), a value of the wrong type or out of range.
+    """
     changes = OmegaConf.create()
     for key, value in overrides.items():
         OmegaConf.update(changes, key, value)
@@ -69,17 +103,16 @@ def load_settings(schema: type[Settings], scene: str, preset: str, overrides: Ma
             raise ConfigError(f"{key} is a group of settings; set its members: {', '.join(members)}.")
         if key not in known:
             raise ConfigError(
-                f"Unknown setting {key!r}{did_you_mean(key, known)}\n"
-                f"Settings of this scene are listed in {preset_folder() / scene / (preset + '.yaml')}."
+                f"Unknown setting {key!r}{did_you_mean(key, known)}\nSettings ({where}): {', '.join(sorted(known))}."
             )
     try:
         merged = OmegaConf.merge(OmegaConf.structured(schema), base, changes)
         settings = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         reason = str(error).strip().splitlines()[0]
-        raise ConfigError(f"{error.full_key or scene}: {reason} (scene {scene}, preset {preset}).") from error
+        raise ConfigError(f"{error.full_key or where}: {reason} ({where}).") from error
     except ValueError as error:
-        raise ConfigError(f"{error} (scene {scene}, preset {preset}).") from error
+        raise ConfigError(f"{error} ({where}).") from error
     assert isinstance(settings, schema)
     return settings
 

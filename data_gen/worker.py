@@ -2,10 +2,13 @@
 
 import os
 import signal
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
+
+from data_gen.stage_clock import StageClock
 
 _state: dict[str, Any] = {}
 
@@ -25,13 +28,13 @@ class Stopped(Exception):  # noqa: N818 - not an error: the parent asked for it
 def environment(backend: str) -> dict[str, str]:
     """Return the variables that workers need before they import anything."""
     variables = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    if backend != "raycast":
+    if backend in ("egl", "osmesa"):
         # llvmpipe's own threads only disturb when every core has its own worker.
         variables |= {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend, "LP_NUM_THREADS": "0"}
     return variables
 
 
-def start(scene: str, settings: Any, backend: str, stop_event: StopEvent | None) -> None:
+def start(family: str, settings: Any, backend: str, stop_event: StopEvent | None) -> None:
     """Build the scene of this process.
 
     With a ``stop_event`` this is a worker: Ctrl-C is left to the parent, which sets the event, and SIGTERM is noted and
@@ -43,7 +46,7 @@ def start(scene: str, settings: Any, backend: str, stop_event: StopEvent | None)
         signal.signal(signal.SIGTERM, _note)
         if hasattr(signal, "pthread_sigmask"):
             signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
-    _state["scene"] = import_module(f"data_gen.{scene}").Scene(settings, backend)
+    _state["scene"] = import_module(f"data_gen.{family}").Scene(settings, backend)
     _state["storage"] = settings.storage
     _state["stop"] = stop_event
     _state["parent"] = os.getppid()
@@ -56,15 +59,25 @@ def stop() -> None:
         scene.close()
 
 
-def make_file(seed: int, split: str, index: int, path: Path, scene_hash: str) -> str:
-    """Simulate, render and write one trajectory; return the SHA-256 of its file."""
+@dataclass(frozen=True)
+class MadeFile:
+    """A finished trajectory: the SHA-256 of its file, and the CPU seconds of each stage."""
+
+    sha256: str
+    seconds: dict[str, float]
+
+
+def make_file(seed: int, split: str, index: int, path: Path, scene_hash: str) -> MadeFile:
+    """Simulate, render and write one trajectory."""
     from vpd_lightning.data.manifest import file_sha256
     from vpd_lightning.data.schema import write_trajectory
 
-    trajectory = _state["scene"].trajectory(seed, split, index, scene_hash, _check_stop)
-    storage = _state["storage"]
-    write_trajectory(path, trajectory, compression=storage.compression, depth_encoding=storage.depth_encoding)
-    return file_sha256(path)
+    clock, storage = StageClock(), _state["storage"]
+    trajectory = _state["scene"].trajectory(seed, split, index, scene_hash, _check_stop, clock)
+    with clock.measure("write"):
+        write_trajectory(path, trajectory, compression=storage.compression, depth_encoding=storage.depth_encoding)
+        sha256 = file_sha256(path)
+    return MadeFile(sha256, clock.seconds)
 
 
 def _note(number: int, frame: FrameType | None) -> None:

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data_gen.mujoco_block_settings import MujocoBlockSettings
+from data_gen.mujoco_block.settings import MujocoBlockSettings
 
 _NUM_LIGHTS = 9  # directions that sample the light's disc
 _FLOOR, _BLOCK = 0, 1
@@ -42,6 +42,8 @@ class _View:
 
 class RaycastRenderer:
     """Renders the block scene; pixels, depth (metres along the optical axis, 0 = nothing) and segmentation."""
+
+    name = "raycast"
 
     def __init__(
         self,

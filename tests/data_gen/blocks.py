@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.generate import generate
-from data_gen.mujoco_block import MujocoBlockScene
-from data_gen.mujoco_block_settings import MujocoBlockSettings
+from data_gen.mujoco_block import Scene as MujocoBlockScene
+from data_gen.mujoco_block import Settings as MujocoBlockSettings
 from data_gen.settings import load_settings
 
 SMALL = {

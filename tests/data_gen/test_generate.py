@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from data_gen import dataset_folder
 from data_gen import generate as module
 from tests.data_gen.blocks import contents, generate_small
 from vpd_lightning.data.ground_truth import read_state
@@ -132,7 +133,7 @@ def test_folder_with_strange_trajectories_is_left_alone(folder: Path, tmp_path: 
 
 
 def test_full_disk_is_told_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(module, "_DISK_RESERVE", 2**60)
+    monkeypatch.setattr(dataset_folder, "_DISK_RESERVE", 2**60)
 
     with pytest.raises(DataError, match=r"GiB free; 4 trajectories need about"):
         generate_small(tmp_path / "out")
@@ -141,7 +142,7 @@ def test_full_disk_is_told_before_anything_is_written(tmp_path: Path, monkeypatc
 
 def test_two_generators_do_not_share_a_folder(tmp_path: Path):
     plan = module.make_plan("mujoco_block", "tiny", tmp_path / "out", 0, {})
-    with module._claim_folder(plan), pytest.raises(DataError, match="Another vpd-data"), module._claim_folder(plan):
+    with plan.folder.claim(), pytest.raises(DataError, match="Another vpd-data"), plan.folder.claim():
         pass
 
 
