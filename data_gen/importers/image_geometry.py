@@ -1,0 +1,110 @@
+"""From the source's images to the data set's: undistort, crop, rescale; the intrinsics follow exactly."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from data_gen.importers.images import nearest_pixels
+from data_gen.importers.lens import distort
+from data_gen.importers.recording import Recording
+from data_gen.importers.settings import ImportSettings
+from vpd_lightning.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+
+class ImageGeometry:
+    """One recording's way from read images to written ones.
+
+    Undistortion keeps each view's intrinsics; colour is interpolated, depth takes the nearest pixel, and what the lens
+    did not see becomes black with depth 0. Then ``crop`` is cut out and scaled to ``height`` x ``width``: colour by
+    area (by interpolation where it grows), depth by the nearest pixel, because an average over an edge lies in the air.
+
+    Raises:
+        ConfigError: at construction, when the crop leaves the image or the pixels would no longer be square.
+    """
+
+    def __init__(self, recording: Recording, settings: ImportSettings) -> None:
+        self.recording = recording
+        left, top, width, height = settings.crop or (0, 0, recording.width, recording.height)
+        if left + width > recording.width or top + height > recording.height:
+            raise ConfigError(
+                f"crop=[{left},{top},{width},{height}] leaves the images of {recording.name}, which are "
+                f"{recording.width}x{recording.height} pixels."
+            )
+        self.left, self.top, self.crop_width, self.crop_height = left, top, width, height
+        self.height = settings.height or (_proportional(settings.width, height, width) if settings.width else height)
+        self.width = settings.width or (_proportional(settings.height, width, height) if settings.height else width)
+        self._maps: dict[int, tuple[bytes, tuple[Array, Array]]] = {}
+
+    def intrinsics(self) -> Array:
+        """Return the recording's intrinsics, (view, 3, 3) or (time, view, 3, 3), for the written images."""
+        matrices = self.recording.intrinsics.copy()
+        matrices[..., 0, 2] -= self.left
+        matrices[..., 1, 2] -= self.top
+        matrices[..., 0, :] *= self.width / self.crop_width  # pixel centres at +0.5: scaling is about the corner
+        matrices[..., 1, :] *= self.height / self.crop_height
+        return matrices
+
+    def rgb(self, frame: int, view: int) -> NDArray[np.uint8]:
+        """Read and convert one colour image (height, width, 3)."""
+        image = self._checked("rgb", frame, view, self.recording.read_rgb(frame, view), np.uint8, 3)
+        maps = self._undistortion(frame, view)
+        if maps is not None:
+            columns, rows = (values.astype(np.float32) for values in maps)
+            image = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        image = image[self.top : self.top + self.crop_height, self.left : self.left + self.crop_width]
+        if (self.height, self.width) == (self.crop_height, self.crop_width):
+            return image
+        grows = self.height > self.crop_height or self.width > self.crop_width
+        return cv2.resize(image, (self.width, self.height), interpolation=cv2.INTER_LINEAR if grows else cv2.INTER_AREA)
+
+    def depth(self, frame: int, view: int) -> NDArray[np.float32]:
+        """Read and convert one depth image (height, width); always measured values, never averages."""
+        image = self._checked("depth", frame, view, self.recording.read_depth(frame, view), np.float32, 1)
+        image = np.where(np.isfinite(image) & (image > 0), image, np.float32(0))
+        pixels = np.ix_(
+            self.top + nearest_pixels(self.height, self.crop_height),
+            self.left + nearest_pixels(self.width, self.crop_width),
+        )
+        maps = self._undistortion(frame, view)
+        if maps is None:
+            return image[pixels]
+        columns, rows = (np.rint(values[pixels]) for values in maps)
+        seen = (columns >= 0) & (columns < image.shape[1]) & (rows >= 0) & (rows < image.shape[0])
+        depth = np.zeros((self.height, self.width), np.float32)
+        depth[seen] = image[rows[seen].astype(np.intp), columns[seen].astype(np.intp)]
+        return depth
+
+    def _undistortion(self, frame: int, view: int) -> tuple[Array, Array] | None:
+        """Return where each undistorted pixel lies in the read image (column, row; pixel centres at integers)."""
+        if self.recording.distortion is None or not np.any(self.recording.distortion[view]):
+            return None
+        matrix = self.recording.intrinsics_at(frame)[view]
+        key = matrix.tobytes()
+        cached = self._maps.get(view)
+        if cached is None or cached[0] != key:
+            maps = _distorted_pixels(matrix, self.recording.distortion[view], self.recording)
+            self._maps[view] = cached = (key, maps)
+        return cached[1]
+
+    def _checked(self, name: str, frame: int, view: int, image: NDArray[Any], dtype: type, channels: int) -> Any:
+        shape = (self.recording.height, self.recording.width, 3)[: 3 if channels == 3 else 2]
+        if image.dtype != dtype or image.shape != shape:
+            raise ValueError(f"{name}({frame}, {view}) is {image.dtype} {image.shape}; it must be {dtype} {shape}")
+        return image
+
+
+def _distorted_pixels(matrix: Array, distortion: Array, recording: Recording) -> tuple[Array, Array]:
+    v, u = np.meshgrid(np.arange(recording.height) + 0.5, np.arange(recording.width) + 0.5, indexing="ij")
+    y = (v - matrix[1, 2]) / matrix[1, 1]
+    x = (u - matrix[0, 2] - matrix[0, 1] * y) / matrix[0, 0]
+    x, y = distort(x, y, distortion)
+    columns = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]
+    return columns - 0.5, matrix[1, 1] * y + matrix[1, 2] - 0.5
+
+
+def _proportional(given: int, side: int, other: int) -> int:
+    return max(1, round(given * side / other))

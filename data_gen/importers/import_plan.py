@@ -1,0 +1,124 @@
+"""What an import will write: which clips, from which images, in which world; and each clip made into a trajectory."""
+
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_gen.importers.clips import Clip, plan_clips
+from data_gen.importers.formats import open_format
+from data_gen.importers.image_geometry import ImageGeometry
+from data_gen.importers.scene_bounds import SceneBounds, sample_points, scene_bounds
+from data_gen.importers.settings import ImportSettings
+from data_gen.importers.world_frame import WorldFrame
+from vpd_lightning.data.schema import Trajectory
+from vpd_lightning.errors import DataError
+
+
+@dataclass(frozen=True)
+class ImportPlan:
+    """What is to be written, and how the recordings become it."""
+
+    source: Path
+    format: str
+    settings: ImportSettings
+    clips: list[Clip]
+    geometries: dict[str, ImageGeometry]
+    frame: WorldFrame
+    bounds: SceneBounds
+    remarks: list[str]
+
+
+def make_plan(path: Path, settings: ImportSettings, found: tuple[WorldFrame, SceneBounds] | None = None) -> ImportPlan:
+    """List the recordings and decide everything that does not need all their images.
+
+    ``found`` is what an earlier call found out by looking at images; with it none is read.
+    """
+    name, module = open_format(path, settings.format)
+    recordings = list(itertools.islice(module.recordings(path, settings), settings.max_recordings))
+    if not recordings:
+        raise DataError(f"{path} holds no recording.")
+    names = [recording.name for recording in recordings]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise DataError(f"{path} has two recordings named {twice!r}; rename one.")
+    clips, remarks = plan_clips(recordings, settings)
+    kept = {clip.recording.name: clip.recording for clip in clips}
+    geometries = {name: ImageGeometry(recording, settings) for name, recording in kept.items()}
+    _require_one_shape(geometries)
+    if found is not None:
+        return ImportPlan(path, name, settings, clips, geometries, *found, remarks)
+    frame = WorldFrame(settings.up, settings.scale or 1.0)
+    points = sample_points(list(geometries.values()), frame, settings.every)
+    if settings.recenter:
+        shift = -np.round(np.median(points.positions, axis=0), 6)
+        frame = WorldFrame(settings.up, settings.scale or 1.0, shift)
+    bounds = scene_bounds(points, frame.shift, settings)
+    return ImportPlan(path, name, settings, clips, geometries, frame, bounds, remarks)
+
+
+def clip_trajectory(
+    plan: ImportPlan, clip: Clip, scene_hash: str, check_stop: Callable[[], None] = lambda: None
+) -> Trajectory:
+    """Read and convert all images of one clip; ``check_stop`` is called before each frame and may raise."""
+    recording, geometry, settings = clip.recording, plan.geometries[clip.recording.name], plan.settings
+    shape = (len(clip.frames), recording.num_views, geometry.height, geometry.width)
+    rgb, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
+    for time, frame in enumerate(clip.frames):
+        check_stop()
+        for view in range(recording.num_views):
+            rgb[time, view] = geometry.rgb(frame, view)
+            depth[time, view] = plan.frame.depth(geometry.depth(frame, view))
+    intrinsics, poses = geometry.intrinsics(), plan.frame.poses(recording.cam_to_world)
+    kept = list(clip.frames)
+    return Trajectory(
+        rgb=rgb,
+        depth=depth,
+        intrinsics=intrinsics if intrinsics.ndim == 3 else intrinsics[kept],
+        cam_to_world=poses if poses.ndim == 3 else poses[kept],
+        frame_time=recording.frame_time * settings.every,
+        near=plan.bounds.near,
+        far=plan.bounds.far,
+        workspace_min=plan.bounds.workspace_min,
+        workspace_max=plan.bounds.workspace_max,
+        seed=settings.seed,
+        source_depth_type=recording.source.get("depth_type", "z"),
+        engine=f"imported from {plan.format}",
+        scene_hash=scene_hash,
+        attributes=_attributes(plan, clip),
+    )
+
+
+def _attributes(plan: ImportPlan, clip: Clip) -> dict[str, Any]:
+    """Return what a reader may want to know of the source; ``recording`` keeps clips of one recording together."""
+    recording, settings = clip.recording, plan.settings
+    found = {f"source_{key}": value for key, value in recording.source.items() if key not in ("format", "depth_type")}
+    return {
+        **found,
+        "recording": recording.name,
+        "clip": clip.number,
+        "source_format": plan.format,
+        "source_first_frame": clip.frames[0],
+        "source_every": settings.every,
+        "source_frame_time": recording.frame_time,
+        "source_scale": plan.frame.scale,
+        "source_up": plan.frame.up,
+        "source_shift": plan.frame.shift,
+        "source_size": np.array([recording.width, recording.height]),
+        "source_undistorted": recording.distortion is not None,
+    }
+
+
+def _require_one_shape(geometries: Mapping[str, ImageGeometry]) -> None:
+    shapes: dict[tuple[int, int, int], str] = {}
+    for name, geometry in geometries.items():
+        shapes.setdefault((geometry.recording.num_views, geometry.height, geometry.width), name)
+    if len(shapes) > 1:
+        listed = "; ".join(f"{v} views of {w}x{h} in {name}" for (v, h, w), name in list(shapes.items())[:3])
+        raise DataError(
+            f"The recordings differ in views or size: {listed}.\nA data set has one shape: set height= and width= "
+            "(and crop=), or import the kinds into data sets of their own."
+        )
