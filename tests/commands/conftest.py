@@ -9,11 +9,14 @@ import pytest
 from data_gen.generate import generate
 from vpd_lightning.commands import train
 
+SMALL = {"camera.num_views": 3, "camera.height": 32, "camera.width": 32}
+
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three cameras, ten frames of a tossed block, ray cast."""
-    return generate("mujoco_block", "tiny", tmp_path_factory.mktemp("data") / "tiny", seed=0, workers=1)
+    """Three cameras of 32x32, ten frames of a tossed block, ray cast."""
+    folder = tmp_path_factory.mktemp("data") / "tiny"
+    return generate("mujoco_block", "tiny", folder, seed=0, workers=1, overrides=SMALL)
 
 
 @pytest.fixture(scope="session")
@@ -22,7 +25,7 @@ def quick(dataset: Path) -> list[str]:
     return [
         "experiment=tiny", f"data.folder={dataset}", "trainer.max_steps=2", "trainer.val_check_interval=2",
         "callbacks.keep_checkpoints.every_n_steps=1", "callbacks.draw_rollouts=null", "logger=csv",
-        "encoder.num_particles=64", "data.rays_per_step=16", "num_threads=1",
+        "encoder.num_particles=64", "data.rays_per_step=16", "num_threads=1", "scene.input_views=[0,1,2]",
     ]  # fmt: skip
 
 

@@ -90,8 +90,11 @@ def test_missing_data_come_with_the_command_that_makes_them(in_folder: Path, fai
     assert "vpd-data generate scene=mujoco_block preset=paper out=datasets/mujoco_block" in message
 
 
-def test_missing_data_of_a_set_that_is_not_generated(in_folder: Path, fails: Fails):
-    assert "there is no data set in datasets/movi_a" in fails(train.main, ["experiment=movi_a", "trainer=cpu"], 3)
+def test_missing_data_that_nothing_generates(in_folder: Path, fails: Fails):
+    message = fails(train.main, ["data.folder=mine", "trainer=cpu"], 3)
+
+    assert "there is no data set in mine" in message
+    assert "import recordings" in message
 
 
 def test_data_file_that_is_gone(quick: list[str], dataset: Path, tmp_path: Path, in_folder: Path, fails: Fails):

@@ -33,7 +33,7 @@ def test_validate_lists_faults_and_fails(tmp_path: Path, capsys: pytest.CaptureF
 
     assert main(["validate", str(tmp_path)]) == 3
     printed = capsys.readouterr()
-    assert "fault manifest" in printed.out and "fault unreadable" in printed.out
+    assert "fault manifest" in printed.out and "fault damaged_file" in printed.out
     assert "has 2 faults" in printed.err
 
 
@@ -42,7 +42,12 @@ def test_validate_lists_faults_and_fails(tmp_path: Path, capsys: pytest.CaptureF
     [
         ([], 2, ""),
         (["generat"], 2, "did you mean 'generate'"),
-        (["import", "somewhere", "out=x"], 2, "import is not available yet"),
+        (["import", "somewhere"], 2, "import takes one source"),
+        (["import", "{folder}/nowhere", "out={out}"], 3, "There is no"),
+        (["import", "{folder}", "out={out}", "formt=tum"], 2, "did you mean 'format'"),
+        (["import", "{folder}", "out={out}", "format=tun"], 2, "did you mean 'tum'"),
+        (["split", "{folder}", "train=0.5", "size=3"], 2, "split has no setting 'size'"),
+        (["split", "{folder}", "train=0.5"], 3, "No data set in"),
         (["generate"], 2, "generate needs scene=..., preset=..., out=..."),
         (["generate", "scene=mujoco_block", "preset=tiny"], 2, "generate needs out=..."),
         (["generate", "demo", *TINY, "out={out}"], 2, "not 'demo'"),
@@ -50,12 +55,12 @@ def test_validate_lists_faults_and_fails(tmp_path: Path, capsys: pytest.CaptureF
         (["generate", *TINY, "out={out}", "seed=1", "seed=2"], 2, "seed is given twice"),
         (["generate", *TINY, "out={out}", "seed=x"], 2, "seed is 'x'"),
         (["generate", *TINY, "out={out}", "seed=-1"], 2, "seed is -1"),
-        (["generate", *TINY[2:], "scene=moon", "preset=tiny", "out={out}"], 2, "Available: mujoco_block"),
+        (["generate", *TINY[2:], "scene=moon", "preset=tiny", "out={out}"], 2, "Available: deformable_block"),
         (["generate", "scene=mujoco_block", "preset=big", "out={out}"], 2, "Available: demo, paper, tiny"),
         (["generate", *TINY, "out={out}", "split.test=1"], 2, "did you mean 'splits.test'"),
         (["generate", *TINY, "out={out}", "splits.test=two"], 2, "splits.test"),
         (["generate", *TINY, "out={out}", "splits.test=[1"], 2, "cannot be read"),
-        (["generate", *TINY, "out={out}", "renderer=vulkan"], 2, "auto, egl, osmesa, raycast"),
+        (["generate", *TINY, "out={out}", "renderer=vulkan"], 2, "auto, egl, osmesa, blender, raycast"),
         (["generate", *TINY, "out={file}"], 3, "is a file"),
         (["generate", *TINY, "out={file}/inside"], 3, "cannot be written"),
         (["inspect"], 2, "inspect takes one folder"),

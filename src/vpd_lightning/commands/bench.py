@@ -48,6 +48,7 @@ def _bench(config: Mapping[str, Any]) -> None:
         repeats=config["repeats"],
         checkpoints=[Path(path).expanduser() for path in config["ckpt"]],
         data=None if folder is None else Path(folder),
+        preset=config["data"]["preset"],
     )
     out = default_folder() if config["out"] is None else Path(config["out"]).expanduser()
     paths = []

@@ -1,45 +1,16 @@
-"""``vpd-data``: generate, inspect and validate data sets."""
+"""``vpd-data``: generate, import, inspect, validate and split data sets."""
 
 import difflib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from vpd_lightning.commands.data_help import HELP
 from vpd_lightning.commands.report_errors import run_command
 from vpd_lightning.errors import ConfigError, DataError
 
-HELP = """vpd-data: make, look at and check data sets of posed RGB-D video
-
-  vpd-data generate scene=NAME preset=paper|demo|tiny out=FOLDER [seed=0] [renderer=...] [workers=N] [SETTING=VALUE ...]
-      Simulate and render. Resumes where it stopped; the same seed gives the same physics.
-      scene     mujoco_block: a block with six colours tossed onto a floor
-      preset    paper: the paper's counts and sizes (7 GiB, an hour of CPU); demo: 208 small ones; tiny: seconds
-      renderer  auto (EGL, then OSMesa), egl, osmesa, raycast (needs no GL); the preset's by default
-      workers   processes; all cores by default; never changes the data
-      SETTING   any setting of the preset, for example splits.train=8 camera.num_views=4 block.side=0.2
-
-  vpd-data inspect FOLDER [out=FOLDER]
-      Print what is in a data set (or one .h5 file) and draw a contact sheet (into the data set by default).
-
-  vpd-data validate FOLDER
-      Check every file, its checksum, and whether depths and poses of the views agree; names each fault.
-
-  vpd-data import SOURCE out=FOLDER
-      Not available yet; docs/your_data.md says how to write the format from your own recordings.
-
-Examples
-  vpd-data generate scene=mujoco_block preset=demo out=datasets/mujoco_block_demo
-  vpd-data generate scene=mujoco_block preset=paper out=datasets/mujoco_block seed=1 workers=8
-  vpd-data generate scene=mujoco_block preset=tiny out=/tmp/blocks splits.train=8 renderer=egl
-  vpd-data inspect datasets/mujoco_block_demo
-  vpd-data validate datasets/mujoco_block_demo
-
-Exit codes: 0 ok, 2 wrong arguments, 3 bad or missing data (or no GL), 5 out of memory, 130 Ctrl-C, 143 SIGTERM.
-debug=true adds the traceback to an error.
-"""
-
-VERBS = ("generate", "inspect", "validate", "import")
+_TEXT_SETTINGS = ("out", "scene", "preset", "renderer", "format", "mapping", "pixel_center", "up")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,17 +25,9 @@ def _run(words: list[str]) -> int:
         return 0 if words else ConfigError.exit_code
     verb, *rest = words
     if verb not in VERBS:
-        near = _did_you_mean(verb, VERBS)
+        near = _did_you_mean(verb, tuple(VERBS))
         raise ConfigError(f"Unknown verb {verb!r}{near}\nVerbs: {', '.join(VERBS)}. See vpd-data --help.")
-    places, settings = parse(rest)
-    if verb == "generate":
-        return _generate(places, settings)
-    if verb == "import":
-        raise ConfigError(
-            "vpd-data import is not available yet.\n"
-            "docs/your_data.md describes the files; data.schema.write_trajectory writes them from NumPy arrays."
-        )
-    return _inspect(places, settings) if verb == "inspect" else _validate(places, settings)
+    return VERBS[verb](*parse(rest))
 
 
 def parse(words: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
@@ -83,7 +46,7 @@ def parse(words: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
             continue
         if key in settings:
             raise ConfigError(f"{key} is given twice.")
-        if key in ("out", "scene", "preset", "renderer"):  # text as it stands, also when it looks like a number
+        if key in _TEXT_SETTINGS:  # text as it stands, also when it looks like a number
             settings[key] = value
             continue
         try:
@@ -119,28 +82,51 @@ def _generate(places: Sequence[str], settings: dict[str, Any]) -> int:
     return 0
 
 
+def _import(places: Sequence[str], settings: dict[str, Any]) -> int:
+    if len(places) != 1 or not settings.get("out"):
+        raise ConfigError("import takes one source and a folder to write:\n  vpd-data import SOURCE out=datasets/NAME")
+    from data_gen.importers.run import import_recordings
+
+    import_recordings(places[0], settings.pop("out"), settings)
+    return 0
+
+
 def _inspect(places: Sequence[str], settings: dict[str, Any]) -> int:
     path = _one_place("inspect", places)
     _only("inspect", settings, ("out",))
-    from vpd_lightning.data.inspect import describe, draw_contact_sheet
+    from vpd_lightning.data.inspect import describe, inspect_dataset
 
     print(describe(path))
-    sheet = draw_contact_sheet(path, Path(settings["out"]) if settings.get("out") else None)
-    print(f"contact sheet: {sheet}")
+    for drawn in inspect_dataset(path, Path(settings["out"]) if settings.get("out") else None):
+        print(f"wrote          {drawn}")
     return 0
 
 
 def _validate(places: Sequence[str], settings: dict[str, Any]) -> int:
     path = _one_place("validate", places)
     _only("validate", settings, ())
-    from vpd_lightning.data.validate import validate_dataset
+    from vpd_lightning.data.validate import check_dataset
 
-    faults = validate_dataset(path)
-    for fault in faults:
+    report = check_dataset(path)
+    for fault in report.faults:
         print(fault)
-    if any(fault.is_error for fault in faults):
-        raise DataError(f"{path} has {sum(fault.is_error for fault in faults)} faults, listed above.")
+    if report.summary:
+        print(report.summary)
+    num_errors = sum(fault.is_error for fault in report.faults)
+    if num_errors:
+        raise DataError(f"{path} has {num_errors} fault{'s' * (num_errors > 1)}, listed above.")
     print(f"{path} is valid.")
+    return 0
+
+
+def _split(places: Sequence[str], settings: dict[str, Any]) -> int:
+    path = _one_place("split", places)
+    _only("split", settings, ("train", "validation", "test", "seed"))
+    from vpd_lightning.data.split import split_dataset
+
+    result = split_dataset(path, **settings)
+    for name, count in result.num_trajectories.items():
+        print(f"{name:11}{count} trajectories of {result.num_recordings[name]} recordings")
     return 0
 
 
@@ -168,6 +154,15 @@ def _whole_number(key: str, value: Any) -> int:
 def _did_you_mean(value: str, choices: Sequence[str]) -> str:
     near = difflib.get_close_matches(value, choices, n=1)
     return f"; did you mean {near[0]!r}?" if near else "."
+
+
+VERBS: dict[str, Callable[[Sequence[str], dict[str, Any]], int]] = {
+    "generate": _generate,
+    "import": _import,
+    "inspect": _inspect,
+    "validate": _validate,
+    "split": _split,
+}
 
 
 if __name__ == "__main__":

@@ -32,6 +32,9 @@ _EXTRAS = {
     "torch-cluster": ("a neighbour backend", "make cluster"),
     "triton": ("fast kernels on GPUs", "pip install triton (PyTorch for CUDA brings it along)"),
     "wandb": ("logger=wandb", "pip install wandb"),
+    "rosbags": ("importing ROS bags", "pip install 'vpd-lightning[ros]'"),
+    "pyarrow": ("importing LeRobot data sets", "pip install 'vpd-lightning[lerobot]'"),
+    "av": ("importing LeRobot videos", "pip install 'vpd-lightning[lerobot]'"),
 }
 _NEIGHBOR_BACKENDS = {
     "torch": "torch",
@@ -42,7 +45,7 @@ _NEIGHBOR_BACKENDS = {
 }
 _GL_PACKAGES = (
     "apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0 libgl1 (EGL), or libosmesa6 (OSMesa); "
-    "renderer=raycast needs neither"
+    "scene=mujoco_block renderer=raycast needs neither"
 )
 
 
@@ -78,6 +81,7 @@ def collect() -> dict[str, Any]:
         "neighbors": {
             name: importlib.util.find_spec(module) is not None for name, module in _NEIGHBOR_BACKENDS.items()
         },
+        "blender": _blender(),
         "optional": {name: version_of(name) for name in _EXTRAS},
         "problems": problems,
     }
@@ -106,6 +110,7 @@ def render(report: dict[str, Any]) -> str:
     for name, installed in report["optional"].items():
         purpose, command = _EXTRAS[name]
         lines.append(f"  {name:26}{installed or f'missing, for {purpose}: {command}'}")
+    lines.append(f"  {'blender':26}{report['blender'] or 'missing, for renderer=blender: make blender'}")
     lines += ["", *(report["problems"] or ["Everything that is required is there."])]
     return "\n".join(lines)
 
@@ -131,6 +136,16 @@ def _packages() -> tuple[dict[str, dict[str, str | None]], list[str]]:
     if not (3, 11) <= sys.version_info[:2] <= (3, 13):
         problems.append(f"Python {platform.python_version()} is not supported; use 3.11, 3.12 or 3.13.")
     return packages, problems
+
+
+def _blender() -> str | None:
+    """Return the Python that has Blender, or None."""
+    from data_gen.blender.process import find_python
+
+    try:
+        return str(find_python())
+    except ConfigError:
+        return None
 
 
 def _gl_backends() -> dict[str, str | None]:

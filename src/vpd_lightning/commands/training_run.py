@@ -106,14 +106,17 @@ def _provide_data(config: dict[str, Any]) -> None:
     folder, wanted = Path(config["data"]["folder"]), config["generate"]
     if (folder / FILE_NAME).is_file():
         return
-    if wanted is None:
+    if wanted is None or wanted["scene"] is None:
         raise DataError(
             f"there is no data set in {folder} (no {FILE_NAME}).\n"
             "Point data.folder at one; vpd-data --help says how to generate or import recordings."
         )
     command = f"vpd-data generate scene={wanted['scene']} preset={wanted['preset']} out={folder}"
     if not wanted["when_missing"]:
-        raise DataError(f"there is no data set in {folder} (no {FILE_NAME}).\nMake it: {command}")
+        raise DataError(
+            f"there is no data set in {folder} (no {FILE_NAME}).\nMake it: {command}\n"
+            "Or look first whether everything works, with a tiny one that makes itself: budget=tiny"
+        )
     if int(os.environ.get("LOCAL_RANK", "0")) > 0:
         raise DataError(f"there is no data set in {folder}.\nMake it before training on several devices: {command}")
     from data_gen.generate import generate

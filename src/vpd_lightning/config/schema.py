@@ -41,9 +41,12 @@ class RunConfig:
 
 @dataclass
 class GenerateConfig:
-    """The call of ``vpd-data generate`` that makes the data set; done by itself only ``when_missing`` says so."""
+    """The call of ``vpd-data generate`` that makes the data set; done only where ``when_missing`` says so.
 
-    scene: str = MISSING
+    ``scene`` None: nothing makes it, it was recorded.
+    """
+
+    scene: str | None = None
     preset: str = MISSING
     seed: int = MISSING
     when_missing: bool = MISSING
@@ -141,6 +144,13 @@ class RenderConfig:
 
 
 @dataclass
+class BenchDataChoice(DataChoice):
+    """Also of which preset the trajectories are whose making is timed."""
+
+    preset: str = MISSING
+
+
+@dataclass
 class BenchConfig:
     """Root of ``vpd-bench``; ``suite`` is one name or several."""
 
@@ -150,7 +160,7 @@ class BenchConfig:
     repeats: int = MISSING
     quick: bool = MISSING
     ckpt: list[str] = MISSING
-    data: DataChoice = MISSING
+    data: BenchDataChoice = MISSING
     num_threads: int | None = None
     debug: bool = MISSING
 
