@@ -1,5 +1,6 @@
 """Rows, clocks and interleaved repeats: everything that a suite needs to measure."""
 
+import functools
 import platform
 import time
 from collections import defaultdict
@@ -17,13 +18,17 @@ SIZES = ("full", "quick", "tiny")
 
 @dataclass(frozen=True)
 class Options:
-    """How to measure. ``size`` is full, quick or tiny (tests); ``checkpoints`` are trained models for two suites."""
+    """How to measure. ``size`` is full, quick or tiny (tests); ``checkpoints`` are trained models for two suites.
+
+    ``preset`` is that of the trajectories which suite data makes.
+    """
 
     device: torch.device
     size: str
     repeats: int
     checkpoints: Sequence[Path] = ()
     data: Path | None = None
+    preset: str = "tiny"
 
     def pick(self, full: Any, quick: Any, tiny: Any) -> Any:
         """Return the value that belongs to the size."""
@@ -84,15 +89,23 @@ def seconds_now(device: torch.device) -> float:
 
 
 def interleaved(
-    functions: Mapping[str, Callable[[], Any]], repeats: int, device: torch.device, warm_up: bool = True
+    functions: Mapping[str, Callable[[], Any]],
+    repeats: int,
+    device: torch.device,
+    warm_up: bool = True,
+    clock: Callable[[], float] | None = None,
 ) -> dict[str, list[float]]:
-    """Time functions in turns, so that what slows the machine for a while slows all of them; seconds per function."""
+    """Time functions in turns, so that what slows the machine for a while slows all of them; seconds per function.
+
+    ``clock`` None: that of the device.
+    """
+    now = clock or functools.partial(seconds_now, device)
     seconds: dict[str, list[float]] = {name: [] for name in functions}
     for repeat in range(repeats + warm_up):
         for name, function in functions.items():
-            start = seconds_now(device)
+            start = now()
             function()
-            taken = seconds_now(device) - start
+            taken = now() - start
             if repeat or not warm_up:
                 seconds[name].append(taken)
     return seconds

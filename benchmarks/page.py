@@ -2,7 +2,7 @@
 
 No figure on that page is typed by hand. Between ``<!-- results: FILE VIEW -->`` and ``<!-- end of results -->`` stands
 what this module made of ``FILE.json``; VIEW is ``table``, ``facts``, ``floors`` (of train_step),
-``memory`` (of memory_table) or ``plot``.
+``memory`` (of memory_table), ``reading``, ``making`` (of data) or ``plot``.
 """
 
 import json
@@ -104,6 +104,36 @@ def _memory(content: dict[str, Any], path: Path) -> str:
     return f"{markdown(content['rows'])}\n\n{taken}"
 
 
+def _reading(content: dict[str, Any], path: Path) -> str:
+    """All rows but those of making trajectories."""
+    return _table({**content, "rows": [item for item in content["rows"] if not item.name.startswith("make/")]}, path)
+
+
+def _making(content: dict[str, Any], path: Path) -> str:
+    """One line per data set: processor time of a trajectory by stage, views a second, the time of the whole set."""
+    seconds: dict[str, dict[str, float]] = {}
+    notes: dict[str, str] = {}
+    for item in content["rows"]:
+        if item.name.startswith("make/"):
+            _, scene, stage = item.name.split("/")
+            seconds.setdefault(scene, {})[stage] = item.seconds or 0.0
+            notes[scene] = item.note or notes.get(scene, "")
+    stages = ("simulate", "render", "write", "whole")
+    titles = [
+        "data set",
+        *(f"{stage} (CPU s)" for stage in stages),
+        "views per CPU second",
+        "whole set (CPU min)",
+        "note",
+    ]
+    lines = [_machine(content), "", "| " + " | ".join(titles) + " |", "|---|" + "---:|" * 6 + "---|"]
+    for scene, taken in seconds.items():
+        cells = [f"{taken.get(stage, 0.0):.2f}" for stage in stages]
+        cells += [f"{content['facts'][f'{name}, {scene}']:.0f}" for name in ("views per CPU second", "CPU minutes")]
+        lines.append(f"| {scene} | " + " | ".join(cells) + f" | {notes[scene]} |")
+    return "\n".join(lines)
+
+
 def _machine(content: dict[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in content["versions"].items())
     return f"{content['device']}; {versions}."
@@ -115,6 +145,8 @@ VIEWS: dict[str, Callable[[dict[str, Any], Path], str]] = {
     "floors": _floors,
     "plot": _plot,
     "memory": _memory,
+    "reading": _reading,
+    "making": _making,
 }
 
 
