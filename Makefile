@@ -89,6 +89,10 @@ cluster: $(STAMP) ## Build and install torch-cluster (needs a C++ compiler; 10 t
 	$(BIN)/python -m pip install -c constraints.txt setuptools wheel
 	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation torch-cluster==1.6.3
 
+blender: ## Make .venv-blender for renderer=blender (Python 3.11, 1 GB; GPL-3, in an environment and a process of its own)
+	python3.11 -m venv .venv-blender
+	.venv-blender/bin/python -m pip install bpy==5.0.1 OpenEXR
+
 # Trained models for the suites accuracy and rollout: those under runs/bench, where there are any.
 BENCH_MODELS = $(wildcard runs/bench/*/checkpoints/last.ckpt)
 comma := ,
