@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.settings import differences, settings_hash
-from vpd_lightning.data.manifest import FILE_NAME, SPLITS, Manifest, load_manifest, write_manifest
+from vpd_lightning.data.manifest import FILE_NAME, SPLITS, UNFINISHED_NAME, Manifest, load_manifest, write_manifest
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.data.schema import PARTIAL_SUFFIX, AtomicPath
 from vpd_lightning.errors import DataError
 
-PLAN_FILE = ".unfinished.json"  # what an unfinished data set was asked to be
 _DISK_RESERVE = 64 * 2**20
 
 
@@ -38,6 +37,7 @@ class DatasetFolder:
         if not (self.folder / FILE_NAME).exists():
             return False
         manifest = load_manifest(self.folder)
+        (self.folder / UNFINISHED_NAME).unlink(missing_ok=True)  # of a process killed after the manifest
         found = {"scene": manifest.scene, "seed": manifest.seed, **manifest.settings}
         self._refuse_other(found, "holds a finished data set")
         return True
@@ -51,13 +51,18 @@ class DatasetFolder:
         if self.folder.exists() and not self.folder.is_dir():
             raise DataError(f"{self.folder} is a file. Choose another out=FOLDER.")
         present = sorted(self.folder.glob("*/*.h5"))
-        plan = self.folder / PLAN_FILE
+        plan = self.folder / UNFINISHED_NAME
         if present and plan.exists():
             try:
                 found = json.loads(plan.read_text())
             except ValueError as error:
                 raise DataError(f"{plan} is damaged. Delete {self.folder}, or choose another out=FOLDER.") from error
             self._refuse_other(found, "holds an unfinished data set")
+        if not plan.exists() and (others := self._others()):
+            raise DataError(
+                f"{self.folder} holds other things, for example {others[0].name}.\n"
+                "A data set gets a folder of its own: choose another out=FOLDER."
+            )
         wanted = set(paths)
         strangers = [path for path in present if path not in wanted or not (plan.exists() or self._is_ours(path))]
         if strangers:
@@ -78,9 +83,12 @@ class DatasetFolder:
         handle = os.open(self.folder, os.O_RDONLY)
         try:
             self._lock(handle)
-            for left_over in self.folder.glob(f"**/.*{PARTIAL_SUFFIX}"):  # of a killed process
-                left_over.unlink(missing_ok=True)
-            with AtomicPath(self.folder / PLAN_FILE) as partial:
+            if (self.folder / FILE_NAME).exists():
+                raise DataError(f"Another vpd-data has just finished {self.folder}. Run the command again to see it.")
+            for folder in (self.folder, *(self.folder / split for split in SPLITS)):
+                for left_over in folder.glob(f".*{PARTIAL_SUFFIX}"):  # of a killed process
+                    left_over.unlink(missing_ok=True)
+            with AtomicPath(self.folder / UNFINISHED_NAME) as partial:
                 partial.write_text(json.dumps(self.identity, indent=1) + "\n")
             yield
         finally:
@@ -114,7 +122,7 @@ class DatasetFolder:
                 license=license,
             )
         )
-        (self.folder / PLAN_FILE).unlink(missing_ok=True)
+        (self.folder / UNFINISHED_NAME).unlink(missing_ok=True)
 
     def require_space(self, num_bytes: int, num_files: int, smaller: str) -> None:
         """Refuse to begin what would not fit on the disk; ``smaller`` says how to ask for less."""
@@ -126,6 +134,13 @@ class DatasetFolder:
                 f"The disk of {self.folder} has {free / 2**30:.2f} GiB free; {num_files} trajectories need about "
                 f"{needed / 2**30:.2f} GiB.\nFree some space, choose another out=FOLDER, or {smaller}."
             )
+
+    def _others(self) -> list[Path]:
+        """Return what lies in the folder and belongs to no data set (files that begin with a dot are let be)."""
+        if not self.folder.is_dir():
+            return []
+        found = sorted(path for path in self.folder.iterdir() if not path.name.startswith("."))
+        return [path for path in found if path.name not in SPLITS or not path.is_dir()]
 
     def _is_ours(self, path: Path) -> bool:
         """Tell whether a file is there, opens, and was made from this identity (its images are not read)."""

@@ -44,6 +44,8 @@ class Plan:
         The version of the scene's code is part of it: another version may draw other pictures from the same settings.
         """
         recipe = {"scene_version": self.scene_version, **asdict(self.settings)}
+        for group, name in self.settings.PLACES:
+            recipe[group].pop(name)
         return DatasetFolder(self.out, {"scene": self.scene, "seed": self.seed, **recipe})
 
     def files(self) -> dict[str, list[Path]]:

@@ -50,6 +50,7 @@ class SceneSettings:
     """
 
     RENDERERS: ClassVar[tuple[str, ...]] = ("auto", "egl", "osmesa", "blender")
+    PLACES: ClassVar[tuple[tuple[str, str], ...]] = ()  # (group, name) of settings that say where something lies here
 
     splits: SplitSettings = MISSING
     num_frames: int = MISSING

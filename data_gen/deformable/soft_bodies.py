@@ -63,7 +63,10 @@ class SoftBodies:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of ``state/``, except the segmentation."""
-        half_sizes = np.stack([np.ptp(mesh.vertices, axis=0) / 2 for mesh in self.meshes])
+        # Around the centre of mass, which positions are; the duck's box is not centred there.
+        rests = [self.rest[part] for part in self.parts]
+        centers = [mass @ rest / mass.sum() for mass, rest in zip(self.masses, rests, strict=True)]
+        half_sizes = np.stack([abs(rest - center).max(axis=0) for rest, center in zip(rests, centers, strict=True)])
         return {
             schema.STATE_POSITIONS: self.positions,
             schema.STATE_QUATERNIONS: self.quaternions,

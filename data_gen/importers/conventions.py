@@ -95,11 +95,6 @@ def distance_to_z(distance: NDArray[Any], intrinsics: Array, distortion: Array |
     return (distance.astype(np.float64) / lengths).astype(np.float32)
 
 
-def upright(cam_to_world: Array, up: str) -> Array:
-    """Rotate the world so that its axis ``up`` (``x``, ``-y``, ...) becomes z (exactly: axes are only exchanged)."""
-    return world_rotation(up) @ cam_to_world
-
-
 def world_rotation(up: str) -> Array:
     """Return the (4, 4) rotation that turns the world's axis ``up`` into z, by quarter turns."""
     axis, sign = _UP_AXES[up]

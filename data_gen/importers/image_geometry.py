@@ -5,8 +5,9 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
-from data_gen.importers.images import nearest_pixels
+from data_gen.importers.images import pixel_centers, sample_depth
 from data_gen.importers.lens import distort
 from data_gen.importers.recording import Recording
 from data_gen.importers.settings import ImportSettings
@@ -62,21 +63,18 @@ class ImageGeometry:
         return cv2.resize(image, (self.width, self.height), interpolation=cv2.INTER_LINEAR if grows else cv2.INTER_AREA)
 
     def depth(self, frame: int, view: int) -> NDArray[np.float32]:
-        """Read and convert one depth image (height, width); always measured values, never averages."""
+        """Read and convert one depth image (height, width); nothing is averaged over edges."""
         image = self._checked("depth", frame, view, self.recording.read_depth(frame, view), np.float32, 1)
         image = np.where(np.isfinite(image) & (image > 0), image, np.float32(0))
-        pixels = np.ix_(
-            self.top + nearest_pixels(self.height, self.crop_height),
-            self.left + nearest_pixels(self.width, self.crop_width),
+        rows, columns = np.meshgrid(
+            self.top + pixel_centers(self.height, self.crop_height),
+            self.left + pixel_centers(self.width, self.crop_width),
+            indexing="ij",
         )
         maps = self._undistortion(frame, view)
-        if maps is None:
-            return image[pixels]
-        columns, rows = (np.rint(values[pixels]) for values in maps)
-        seen = (columns >= 0) & (columns < image.shape[1]) & (rows >= 0) & (rows < image.shape[0])
-        depth = np.zeros((self.height, self.width), np.float32)
-        depth[seen] = image[rows[seen].astype(np.intp), columns[seen].astype(np.intp)]
-        return depth
+        if maps is not None:
+            columns, rows = (map_coordinates(values, [rows, columns], order=1, mode="nearest") for values in maps)
+        return sample_depth(image, rows, columns)
 
     def _undistortion(self, frame: int, view: int) -> tuple[Array, Array] | None:
         """Return where each undistorted pixel lies in the read image (column, row; pixel centres at integers)."""

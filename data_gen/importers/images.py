@@ -13,6 +13,7 @@ from vpd_lightning.errors import DataError
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".png", ".npy", ".tiff", ".tif")
+_ONE_SURFACE = 1.05  # largest over smallest depth of four neighbours that belong to one surface
 _MAX_FILE_BYTES = 512 * 2**20
 _MAX_PIXELS = 2**27
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # the markers whose segment holds the image's size
@@ -76,10 +77,39 @@ def depth_in_metres(
     return _fitted(name, depth, height, width)
 
 
-def nearest_pixels(count: int, source_count: int) -> NDArray[np.intp]:
-    """Return which of ``source_count`` pixels lies at each of ``count`` pixel centres of the same field of view."""
-    centers = (np.arange(count) + 0.5) * source_count / count
-    return np.minimum(centers.astype(np.intp), source_count - 1)
+def pixel_centers(count: int, source_count: int) -> NDArray[np.float64]:
+    """Return where ``count`` pixel centres lie among ``source_count`` pixels of the same field of view.
+
+    Source pixels have their centres at whole numbers here.
+    """
+    return (np.arange(count) + 0.5) * source_count / count - 0.5
+
+
+def sample_depth(
+    depth: NDArray[np.float32], rows: NDArray[np.float64], columns: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return z-depth at places between pixels (whose centres are at whole numbers), 0 outside and where none is.
+
+    Where the four pixels around belong to one surface, inverse depth is interpolated, which is exact on planes. The
+    nearest pixel alone would be off by half a pixel to one side whenever an image shrinks by an even factor. Across
+    edges and beside holes the nearest pixel counts: depth is never averaged there.
+    """
+    height, width = depth.shape
+    nearest_row, nearest_column = np.rint(rows).astype(np.intp), np.rint(columns).astype(np.intp)
+    is_seen = (nearest_row >= 0) & (nearest_row < height) & (nearest_column >= 0) & (nearest_column < width)
+    nearest = depth[np.clip(nearest_row, 0, height - 1), np.clip(nearest_column, 0, width - 1)]
+    row = np.clip(np.floor(rows).astype(np.intp), 0, max(height - 2, 0))
+    column = np.clip(np.floor(columns).astype(np.intp), 0, max(width - 2, 0))
+    below, right = np.minimum(row + 1, height - 1), np.minimum(column + 1, width - 1)
+    corners = np.stack([depth[row, column], depth[row, right], depth[below, column], depth[below, right]])
+    corners = corners.astype(np.float64)
+    down, across = rows - row, columns - column
+    is_between = (down >= 0) & (down <= 1) & (across >= 0) & (across <= 1)
+    is_smooth = is_between & (corners.min(axis=0) > 0) & (corners.max(axis=0) <= _ONE_SURFACE * corners.min(axis=0))
+    shares = np.stack([(1 - down) * (1 - across), (1 - down) * across, down * (1 - across), down * across])
+    inverse = (shares / np.where(corners > 0, corners, 1.0)).sum(axis=0)
+    sampled = np.where(is_smooth, 1.0 / np.where(is_smooth, inverse, 1.0), nearest)
+    return np.where(is_seen, sampled, 0.0).astype(np.float32)
 
 
 def _fitted(name: str, depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
@@ -90,7 +120,10 @@ def _fitted(name: str, depth: NDArray[np.float32], height: int, width: int) -> N
             f"{name} is {depth.shape[1]}x{depth.shape[0]}; colour is {width}x{height}, of another shape.\n"
             "Depth must be aligned to colour: see the camera's own software (for RealSense: align to colour)."
         )
-    return depth[np.ix_(nearest_pixels(height, depth.shape[0]), nearest_pixels(width, depth.shape[1]))]
+    rows, columns = np.meshgrid(
+        pixel_centers(height, depth.shape[0]), pixel_centers(width, depth.shape[1]), indexing="ij"
+    )
+    return sample_depth(depth, rows, columns)
 
 
 def _array(path: Path) -> NDArray[Any]:

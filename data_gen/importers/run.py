@@ -21,10 +21,11 @@ from data_gen.progress import Progress
 from data_gen.worker import environment
 from vpd_lightning.data.manifest import SPLITS, file_sha256
 from vpd_lightning.data.schema import write_trajectory
-from vpd_lightning.errors import DataError
+from vpd_lightning.errors import ConfigError, DataError
 
 VERSION = 1  # of what the importers make from the same source and settings
 _PACKAGES = ("numpy", "h5py", "opencv-python-headless", "vpd-lightning")
+_MAPPED = ("ros", "lerobot", "tum")
 SCENE = "recordings"  # the manifest's scene
 _BYTES_PER_PIXEL = 7  # uint8 RGB, float32 depth
 _NOT_IN_FILES = ("format", "mapping", "workers")  # they decide nothing beyond what stands elsewhere in the identity
@@ -50,7 +51,13 @@ def import_recordings(source: str | Path, out: str | Path, overrides: Mapping[st
     folder_path = Path(out).expanduser().absolute()
     if folder_path == path or path.is_dir() and folder_path in path.parents:
         raise DataError(f"out={folder_path} holds the source itself. Choose another out=FOLDER.")
+    if settings.mapping is not None:
+        settings.mapping = str(Path(settings.mapping).expanduser())
+        if not Path(settings.mapping).is_file():
+            raise ConfigError(f"mapping={settings.mapping} is not a file; docs/your_data.md shows what it holds.")
     plan = make_plan(path, settings)
+    if settings.mapping is not None and plan.format not in _MAPPED:
+        raise ConfigError(f"{path} is of format {plan.format}, which takes no mapping ({', '.join(_MAPPED)} do).")
     folder = DatasetFolder(folder_path, _identity(plan))
     if folder.is_complete():
         print(f"{folder_path} is complete already.")
@@ -120,7 +127,7 @@ def _identity(plan: ImportPlan) -> dict[str, Any]:
         "format": plan.format,
         "source": plan.source.name,
         "settings": {name: value for name, value in asdict(plan.settings).items() if name not in _NOT_IN_FILES},
-        "mapping": file_sha256(Path(plan.settings.mapping).expanduser())[:16] if plan.settings.mapping else "",
+        "mapping": file_sha256(Path(plan.settings.mapping))[:16] if plan.settings.mapping else "",
         "cameras_and_frames": digest.hexdigest()[:16],
         "bounds": {name: value for name, value in asdict(plan.bounds).items() if name != "estimated"},
     }

@@ -95,7 +95,9 @@ def scene_bounds(points: SampledPoints, shift: Array, settings: ImportSettings) 
     inside = ((positions >= workspace_min) & (positions <= workspace_max)).all(axis=-1)
     if not inside.any():
         raise DataError(
-            f"No measured point lies in the workspace {_text(workspace_min)} to {_text(workspace_max)}.\n{found}"
+            f"No measured point lies in the workspace {_text(workspace_min)} to {_text(workspace_max)}.\n{found}\n"
+            "If they should, a convention of the source is wrong: import it without near, far and workspace_*, and\n"
+            "vpd-data validate names which."
         )
     distances = points.distances[inside]
     near = (

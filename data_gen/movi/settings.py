@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from omegaconf import MISSING
 
@@ -76,6 +77,8 @@ class ThrowSettings:
 @dataclass
 class MoviSettings(SceneSettings):
     """Everything that decides what is in the data set (with the seed)."""
+
+    PLACES: ClassVar[tuple[tuple[str, str], ...]] = (("objects", "mesh_folder"),)  # its content is in mesh_hash
 
     objects: ObjectSettings = MISSING
     floor: FloorSettings = MISSING

@@ -202,7 +202,7 @@ HARMS: dict[str, tuple[Harm, str]] = {
     "a million views": (empty_of((1, 10**6, 1, 1, 3), (1, 10**6, 1, 1, 3)), "missing_data"),
     "compression bomb of many chunks": (bomb_of_many_chunks, "compression_bomb"),
     "compression bomb in one chunk": (bomb_in_one_chunk, "damaged_data"),
-    "compression bomb in a large chunk": (bomb_in_a_large_chunk, "compression_bomb"),
+    "compression bomb in a large chunk": (bomb_in_a_large_chunk, "damaged_data"),
     "image that is too short": (short_image, "damaged_data"),
     "compressed twice": (two_compressions, "repeated_filter"),
     "unknown filter": (

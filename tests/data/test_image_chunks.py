@@ -115,3 +115,28 @@ def test_checksum_is_that_of_a_plain_loop():
             first = (first + 256 * high + low) % 65_535
             second = (second + first) % 65_535
         assert fletcher32(content, num_bytes) == second << 16 | first
+
+
+@pytest.mark.parametrize("options", [{"compression": "gzip"}, {"compression": "lzf"}, {}, {"fletcher32": True}])
+@pytest.mark.parametrize("chunks", [(1, 1, 24, 20), (2, 2, 10, 20), (3, 2, 24, 20)])
+@pytest.mark.parametrize("mask", [0, 1])
+def test_chunk_that_holds_too_little_is_refused(
+    tmp_path: Path, options: dict[str, Any], chunks: tuple[int, ...], mask: int
+):
+    """HDF5 would go on reading behind the end of what such a chunk holds, packed or not."""
+    content = zlib.compress(bytes(16)) if options.get("compression") == "gzip" and not mask else bytes(16)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        dataset = file.create_dataset("x", data=np.zeros(SHAPE, np.uint8), chunks=chunks, **options)
+        dataset.id.write_direct_chunk((0, 0, 0, 0), content, mask if options else 0)
+    with h5py.File(tmp_path / "a.h5") as file, pytest.raises(DataError, match=r"a\.h5: '/x'"):
+        ImageChunks(tmp_path / "a.h5", file["x"]).read(np.array([0]), np.array([0]))
+
+
+def test_chunk_that_leaves_out_the_shuffle_is_refused(tmp_path: Path):
+    """It is legal, but nothing writes it; taken for shuffled it would give other numbers."""
+    values = np.arange(480, dtype=np.float32).reshape(1, 1, 24, 20)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        dataset = file.create_dataset("x", data=values, chunks=(1, 1, 24, 20), compression="gzip", shuffle=True)
+        dataset.id.write_direct_chunk((0, 0, 0, 0), zlib.compress(values.tobytes()), 1)
+    with h5py.File(tmp_path / "a.h5") as file, pytest.raises(DataError, match="leaves out steps"):
+        ImageChunks(tmp_path / "a.h5", file["x"]).read(np.array([0]), np.array([0]))

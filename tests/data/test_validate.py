@@ -210,3 +210,15 @@ def test_state_of_another_length_is_named(blocks: Path, tmp_path: Path):
         file["state/positions"] = np.zeros((3, 1, 3))
 
     assert "state_length" in names(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "fault"),
+    [("positions", np.nan, "state_not_finite"), ("quaternions", 0.0, "state_quaternions")],
+)
+def test_ground_truth_that_cannot_be_is_named(blocks: Path, tmp_path: Path, name: str, value: float, fault: str):
+    path = shutil.copy(blocks / "train" / "000000.h5", tmp_path / "a.h5")
+    with h5py.File(path, "r+") as file:
+        file[f"state/{name}"][1] = value
+
+    assert names(Path(path)) == [fault]

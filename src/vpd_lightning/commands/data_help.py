@@ -36,7 +36,7 @@ HELP = """vpd-data: make, bring in, look at and check data sets of posed RGB-D v
 Examples
   vpd-data generate scene=mujoco_block preset=demo out=datasets/mujoco_block_demo
   vpd-data generate scene=deformable_collision preset=paper out=datasets/deformable_collision seed=1 workers=8
-  vpd-data generate scene=movi_c preset=tiny out=/tmp/movi objects.mesh_folder=my_scans
+  vpd-data generate scene=movi_c preset=tiny out=datasets/my_scans objects.mesh_folder=my_scans
   vpd-data import recordings/kitchen out=datasets/kitchen height=128 width=128
   vpd-data inspect datasets/mujoco_block_demo
   vpd-data validate datasets/mujoco_block_demo

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpd_lightning.data import schema
-from vpd_lightning.data.hdf5_checks import check_links, checked_dataset, open_file, read_all
+from vpd_lightning.data.hdf5_checks import check_links, checked_dataset, open_file
+from vpd_lightning.data.stored_chunks import read_whole
 from vpd_lightning.errors import DataError
 
 
@@ -60,7 +61,7 @@ def read_state(path: str | Path) -> GroundTruth:
             )
         check_links(path, group)
         arrays = {
-            name: read_all(path, checked_dataset(path, group, name, dtypes=[dtype], num_axes=[num_axes]))
+            name: read_whole(path, checked_dataset(path, group, name, dtypes=[dtype], num_axes=[num_axes]))
             for name, (dtype, num_axes) in _LAYOUT.items()
         }
     return GroundTruth(**arrays)

@@ -11,6 +11,7 @@ from vpd_lightning.data.schema import SCHEMA_VERSION, AtomicPath
 from vpd_lightning.errors import DataError
 
 FILE_NAME = "dataset.json"
+UNFINISHED_NAME = ".unfinished.json"  # what a data set in the making was asked to be
 SPLITS = ("train", "validation", "test")
 _MAX_BYTES = 64 * 2**20
 _MAX_TRAJECTORIES = 400_000
@@ -193,6 +194,8 @@ def _check_places(folder: Path, names: Mapping[str, str]) -> None:
 
 
 def _missing(folder: Path) -> str:
+    if (folder / UNFINISHED_NAME).is_file():
+        return f"{folder} is not finished (there is no {FILE_NAME}).\nRun the command that began it again: it goes on."
     scene, _, preset = folder.name.rpartition("_")
     if scene and preset in ("paper", "demo", "tiny"):
         command, hint = f"scene={scene} preset={preset}", ""

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from vpd_lightning.data import schema
 from vpd_lightning.data.broken_file import refuse
 from vpd_lightning.data.camera_checks import check_intrinsics, check_poses
-from vpd_lightning.data.hdf5_checks import checked_attribute, checked_dataset, named_damage, open_file, read_all
+from vpd_lightning.data.hdf5_checks import checked_attribute, checked_dataset, named_damage, open_file
 from vpd_lightning.data.image_chunks import ImageChunks
+from vpd_lightning.data.stored_chunks import read_whole
 
 MAX_IMAGE_SIDE = 16384
 MAX_FRAMES = 1_000_000
@@ -239,7 +240,7 @@ class TrajectoryReader:
             raise refuse(
                 self.path, "wrong_shape", f"{name!r} has shape {dataset.shape}; it must be {shapes[0]} or {shapes[1]}"
             )
-        return read_all(self.path, dataset)
+        return read_whole(self.path, dataset)
 
 
 class ReaderCache:

@@ -25,6 +25,9 @@ _SCALES = {
     1e-3: "depth is in millimetres: divide it by 1000",
     1e3: "depth is 1000 times too small (metres taken for millimetres): multiply it by 1000",
 }
+# Steps of 0.1, 0.2 (TUM), 0.25, 0.4, 2.5, 4, 5 and 10 mm taken for each other or for millimetres.
+_STEPS = (0.1, 0.2, 0.25, 0.4, 2.5, 4.0, 5.0, 10.0)
+_UNITS = {step: f"depth is in another unit: multiply it by {step:g}" for step in _STEPS}
 _TRANSLATIONS = {1.0: "", 1e-3: "the positions in cam_to_world are in millimetres: divide them by 1000"}
 _SHIFTS = {
     0.0: "",
@@ -53,7 +56,7 @@ class Reading:
         texts = (
             _AXES[self.axes],
             _DEPTHS[self.ray_power],
-            _SCALES[self.depth_scale],
+            {**_SCALES, **_UNITS}[self.depth_scale],
             _TRANSLATIONS[self.translation_scale],
             _SHIFTS[self.pixel_shift],
         )
@@ -113,6 +116,7 @@ def without_shift() -> list[Reading]:
         Reading(axes, ray_power, depth_scale)
         for axes, ray_power, depth_scale in itertools.product(_AXES, _DEPTHS, _SCALES)
     ]
+    readings += [Reading(depth_scale=scale) for scale in _UNITS]
     # To views alone, positions that are too large look like depths that are too small.
     return readings + [replace(r, depth_scale=1.0, translation_scale=1e-3) for r in readings if r.depth_scale == 1e3]
 

@@ -11,6 +11,7 @@ from vpd_lightning.data.reader import TrajectoryReader
 Array = NDArray[np.float64]
 ShotKey = tuple[int, int]  # frame, view
 _BEST_ANGLE = 35.0  # degrees between two cameras: much parallax, and still mostly the same surfaces
+_MAX_VIEWS = 32  # evenly chosen: pairs grow with the square
 _MAX_TIMES_FIXED, _MAX_TIMES_MOVING = 3, 12
 
 
@@ -57,7 +58,7 @@ def choose_pairs(
     if times is None:
         count = min(reader.num_frames, _MAX_TIMES_MOVING if is_moving else _MAX_TIMES_FIXED)
         times = np.unique(np.linspace(0, reader.num_frames - 1, count).round().astype(int)).tolist()
-    views = range(reader.num_views)
+    views = np.unique(np.linspace(0, reader.num_views - 1, _MAX_VIEWS).round().astype(int)).tolist()
     rotations = {
         (time, view): pose[:3, :3]
         for time, poses in zip(times, reader.cameras(list(times))[1], strict=True)

@@ -316,7 +316,7 @@ def test_without_a_mapping_or_its_packages_the_way_out_is_said(
 ):
     with pytest.raises(ConfigError, match="mapping=FILE"):
         import_recordings(images[0], tmp_path / "out")
-    with pytest.raises(ConfigError, match="there is no such file"):
+    with pytest.raises(ConfigError, match="is not a file"):
         import_recordings(images[0], tmp_path / "out", {"mapping": str(tmp_path / "none.yaml")})
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     with pytest.raises(ConfigError, match=r"pip install \"vpd-lightning\[lerobot\]\""):

@@ -9,7 +9,7 @@ import pytest
 from data_gen.importers.run import import_recordings
 from tests.data_gen.importers import known_scene
 from tests.data_gen.importers.checks import TOLERANCE, assert_valid, attributes, camera_errors, files, worst_point
-from tests.data_gen.importers.plain_recording import HEIGHT, MM, WIDTH, change, write_plain
+from tests.data_gen.importers.plain_recording import HEIGHT, WIDTH, change, write_plain
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.data.validate import validate_dataset
 from vpd_lightning.errors import DataError
@@ -78,7 +78,7 @@ def test_colours_arrive_unchanged(tmp_path: Path):
 
 @pytest.mark.parametrize("depth_type", ["z", "distance"])
 def test_distorted_images_are_straightened(tmp_path: Path, depth_type: str):
-    """Nearest depth is up to half a pixel off sideways; most is gone where the neighbour is the exact one."""
+    """Colour is bilinear; depth is exact on planes but for its steps, and never averaged over edges."""
     source = write_plain(tmp_path / "take", num_frames=3, distortion=LENS, depth_type=depth_type, pixel_center=0.0)
 
     out = import_recordings(source, tmp_path / "out")
@@ -98,11 +98,10 @@ def test_distorted_images_are_straightened(tmp_path: Path, depth_type: str):
         assert error.mean() < 0.5 * np.abs(distorted.rgb.astype(float) - picture.rgb)[inner].mean()
         measured = depth[view] > 0
         relative = np.abs(depth[view] - picture.depth)[measured] / picture.depth[measured]
-        # Half a pixel sideways on a floor seen at 22 degrees or more, at 1.1 pixels per milliradian: below 2 %.
-        assert np.quantile(relative, 0.9) < 0.02
-        shown = set(np.round(depth[view][measured] / MM).astype(int).tolist())
-        if depth_type == "z":  # values are taken, never made up between two surfaces
-            assert shown <= set(np.rint(distorted.depth / MM).astype(int).ravel().tolist())
+        assert np.quantile(relative, 0.9) < 1e-3  # the nearest pixel alone would be off by up to 2 %
+        around = np.stack([np.roll(picture.depth, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+        made_up = (depth[view] < 0.99 * around.min(axis=0)) | (depth[view] > 1.01 * around.max(axis=0))
+        assert not made_up[measured & (np.ptp(around, axis=0) < 10)][4:-4].any()
 
 
 def test_what_the_lens_did_not_see_has_no_depth(tmp_path: Path):
@@ -134,7 +133,7 @@ def test_moving_cameras_and_lists_per_frame(tmp_path: Path):
     assert camera_errors(path, intrinsics, poses) == (0.0, 0.0)
 
 
-def test_smaller_depth_images_of_the_same_view_take_the_nearest_pixel(tmp_path: Path):
+def test_smaller_depth_images_of_the_same_view_are_fitted_to_colour(tmp_path: Path):
     source = write_plain(tmp_path / "take", num_frames=3, num_views=2, depth="npy")
     small = {}
     for file in source.glob("*/depth/*.npy"):
@@ -144,7 +143,8 @@ def test_smaller_depth_images_of_the_same_view_take_the_nearest_pixel(tmp_path: 
     out = import_recordings(source, tmp_path / "out", {"height": HEIGHT // 2})
 
     with TrajectoryReader(files(out)[0]) as reader:
-        assert (reader.depth([0], [1])[0, 0] == small["view1", "000000"]).all()
+        relative = np.abs(reader.depth([0], [1])[0, 0] / small["view1", "000000"] - 1)
+    assert np.quantile(relative, 0.9) < 5e-3  # every other pixel stands for the two it was taken from
 
 
 def _mistake(source: Path, kind: str) -> None:
