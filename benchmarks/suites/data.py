@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks import plots
-from benchmarks.measuring import Options, Result, Row, interleaved, num_threads, row
+from benchmarks.measuring import Options, Result, Row, interleaved, row
 from data_gen.settings import preset_names, require_choice, scene_names
 from vpd_lightning.data import schema
 from vpd_lightning.data.datamodule import VideoDataModule
@@ -73,7 +73,6 @@ def reading(folder: Path, options: Options) -> list[Row]:
             windows = {
                 "read": (_window(readers[which], start, views) for which, start in turns),
                 "image by image": (_image_by_image(files[which], start, views) for which, start in turns),
-                "2 threads": (_on_two_threads(readers[which], start, views) for which, start in turns),
                 "open and read": (_opened(original, start, views) for _, start in turns),
             }
             turn_by_turn = {name: functools.partial(next, each) for name, each in windows.items()}
@@ -82,7 +81,6 @@ def reading(folder: Path, options: Options) -> list[Row]:
         note = f"{WINDOW} frames x {len(views)} views of {size}x{size}, colour and depth; wall time, median of {count}"
         rows.append(row(f"read/{storage}", seconds["read"], "image by image", seconds["image by image"], note=note))
         if storage in ("gzip", "lzf"):
-            rows.append(row(f"read/{storage}, 2 threads", seconds["2 threads"], note=note))
             rows.append(row(f"open and read/{storage}", seconds["open and read"], note=note))
     return rows
 
@@ -90,11 +88,6 @@ def reading(folder: Path, options: Options) -> list[Row]:
 def _window(reader: TrajectoryReader, start: int, views: list[int]) -> Window:
     times = range(start, start + WINDOW)
     return reader.rgb(times, views), reader.depth(times, views)
-
-
-def _on_two_threads(reader: TrajectoryReader, start: int, views: list[int]) -> Window:
-    with num_threads(2):
-        return _window(reader, start, views)
 
 
 def _opened(path: Path, start: int, views: list[int]) -> Window:

