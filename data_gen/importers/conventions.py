@@ -1,5 +1,6 @@
 """Other people's camera and depth conventions, turned into ours: once, here, and nowhere else."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -166,3 +167,12 @@ def _numbers(matrix: ArrayLike, where: str) -> Array:
         return np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise DataError(f"{where} is not a matrix of numbers.") from error
+
+
+def join_views(views: Sequence[Array], num_frames: int) -> Array:
+    """Stack the matrices of all views: (view, n, n), or (time, view, n, n) where one of them changes."""
+    still = [matrices[0] if matrices.ndim == 3 and (matrices == matrices[:1]).all() else matrices for matrices in views]
+    if all(matrices.ndim == 2 for matrices in still):
+        return np.stack(still)
+    shape = (num_frames, *still[0].shape[-2:])
+    return np.stack([np.broadcast_to(matrices, shape) for matrices in still], axis=1)

@@ -46,7 +46,7 @@ def read_depth(
 
     Args:
         path: PNG or TIFF with one channel, or ``.npy``. A smaller or larger image of the same field of view (as
-            phones give) takes the nearest measured pixel; depths are never averaged.
+            phones give) is resampled; see ``sample_depth``.
         height: of the colour image.
         width: of the colour image.
         metres_per_step: for integers. ``None``: integers are refused.

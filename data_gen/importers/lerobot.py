@@ -41,6 +41,7 @@ from data_gen.importers.conventions import (
     checked_pose,
     distance_to_z,
     invert_pose,
+    join_views,
     opengl_to_opencv,
     pose_matrix,
     rotation_from_quaternion,
@@ -93,7 +94,7 @@ def _recording(
     axes = [chosen(settings.axes, view.axes) for view in views]
     types = [chosen(settings.depth, view.depth_type) for view in views]
     numbers = folder.numbers(episode, [x for v in views for x in (v.intrinsics, v.pose) if isinstance(x, str)])
-    intrinsics = _joined(
+    intrinsics = join_views(
         [
             shift_principal_point(_intrinsics(view, numbers, episode), 0.5 - center)
             for view, center in zip(views, centers, strict=True)
@@ -116,7 +117,7 @@ def _recording(
         height=height,
         width=width,
         intrinsics=intrinsics,
-        cam_to_world=_joined(
+        cam_to_world=join_views(
             [opengl_to_opencv(pose) if axis == "opengl" else pose for pose, axis in zip(poses, axes, strict=True)],
             episode.num_frames,
         ),
@@ -219,15 +220,6 @@ def _poses(view: MappedView, numbers: Mapping[str, Array], episode: Episode) -> 
     where = f"{view.pose}, {episode}"
     poses = np.stack([checked_pose(row, f"{where}, frame {index}") for index, row in enumerate(matrices)])
     return invert_pose(poses) if view.is_world_to_cam else poses
-
-
-def _joined(views: Sequence[Array], num_frames: int) -> Array:
-    """Stack the views' matrices: (view, n, n), or (time, view, n, n) where one of them changes."""
-    still = [matrices[0] if matrices.ndim == 3 and (matrices == matrices[:1]).all() else matrices for matrices in views]
-    if all(matrices.ndim == 2 for matrices in still):
-        return np.stack(still)
-    shape = (num_frames, *still[0].shape[-2:])
-    return np.stack([np.broadcast_to(matrices, shape) for matrices in still], axis=1)
 
 
 def _distortion(views: Sequence[MappedView]) -> Array | None:

@@ -37,8 +37,8 @@ taken at the same moment. ``cameras.json``::
 ``axes``, ``pixel_center``, ``depth_type`` or ``depth_unit`` of its own. The conventions have no default values, because
 a wrong one spoils a data set without a word; ``vpd-data validate`` tells from the data whether they fit.
 
-Depth is in the colour camera's frame. A depth image of another size but the same field of view (phones) is taken to
-colour by the nearest pixel.
+Depth is in the colour camera's frame. A depth image of another size but the same field of view (phones) is fitted
+to colour.
 """
 
 import re
@@ -56,6 +56,7 @@ from data_gen.importers.conventions import (
     checked_pose,
     distance_to_z,
     invert_pose,
+    join_views,
     opengl_to_opencv,
     shift_principal_point,
 )
@@ -139,8 +140,8 @@ def _recording(folder: Path, settings: ImportSettings) -> Recording:
         name=folder.name,
         height=height,
         width=width,
-        intrinsics=_joined([view.intrinsics for view in views], numbers.pop()),
-        cam_to_world=_joined([view.cam_to_world for view in views], len(views[0].color)),
+        intrinsics=join_views([view.intrinsics for view in views], numbers.pop()),
+        cam_to_world=join_views([view.cam_to_world for view in views], len(views[0].color)),
         num_frames=len(views[0].color),
         num_views=len(views),
         frame_time=settings.frame_time or positive(content, "frame_time", str(file)),
@@ -282,14 +283,6 @@ def _distortions(views: list[_View]) -> NDArray[np.float64] | None:
         if view.distortion is not None:
             joined[index, : len(view.distortion)] = view.distortion
     return joined
-
-
-def _joined(views: list[NDArray[np.float64]], num_frames: int) -> NDArray[np.float64]:
-    """Stack the views' matrices: (view, n, n), or (time, view, n, n) where one of them changes."""
-    if all(matrices.ndim == 2 for matrices in views):
-        return np.stack(views)
-    shape = (num_frames, *views[0].shape[-2:])
-    return np.stack([np.broadcast_to(matrices, shape) for matrices in views], axis=1)
 
 
 def _common(conventions: list[dict[str, str]]) -> dict[str, str]:

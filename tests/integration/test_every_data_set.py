@@ -38,7 +38,7 @@ def numbers(tree: Any) -> list[float]:
     return [tree] if isinstance(tree, int | float) and not isinstance(tree, bool) else []
 
 
-def check_run(run: Path, num_trajectories: int) -> None:
+def check_run(run: Path) -> None:
     """Evaluate the run's last checkpoint: the figures must be there, and be numbers."""
     assert evaluation.main([f"ckpt={run}/checkpoints/last.ckpt", "num_videos=0", "num_threads=1"]) == 0
 
@@ -48,7 +48,6 @@ def check_run(run: Path, num_trajectories: int) -> None:
     assert 3.0 < metrics["psnr"]["mean"] < 50.0  # two steps: anything but broken
     assert metrics["chamfer"]["mean"] > 0
     assert all(math.isfinite(number) for number in numbers(metrics)), metrics
-    assert num_trajectories >= 1
 
 
 @pytest.fixture
@@ -66,7 +65,7 @@ def test_experiment_learns_from_its_data_set_and_is_evaluated(experiment: str, i
 
     assert train.main(words) == 0
 
-    check_run(in_folder / "run", 1)
+    check_run(in_folder / "run")
 
 
 @pytest.mark.slow
@@ -78,4 +77,4 @@ def test_training_makes_its_data_set_in_an_empty_folder(in_folder: Path, capsys:
 
     assert "making it: vpd-data generate scene=deformable_collision preset=tiny" in capsys.readouterr().out
     assert (in_folder / "datasets" / "deformable_collision_tiny" / "dataset.json").is_file()
-    check_run(in_folder / "run", 2)
+    check_run(in_folder / "run")

@@ -65,11 +65,6 @@ def validate_dataset(path: str | Path) -> list[Fault]:
     return check_dataset(path).faults
 
 
-def summary(path: str | Path) -> str:
-    """Return one line: how far apart views place the same surface, and the share of free-space violations."""
-    return check_dataset(path).summary
-
-
 def check_dataset(path: str | Path) -> Report:
     """Check a data set folder or one ``.h5`` file: everything ``vpd-data validate`` says."""
     path = Path(path)
