@@ -8,16 +8,20 @@ from typing import Any
 import torch
 
 from vpd_lightning.errors import CheckpointError, ConfigError
-from vpd_lightning.simulator import Simulator
+from vpd_lightning.export.release_folder import is_release, read_release
 
 _PREFIX = "simulator."
 
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A trained simulator in evaluation mode, the plain configuration it was built from, and the file it came from."""
+    """A trained system in evaluation mode, the plain configuration it was built from, and the file it came from.
 
-    simulator: Simulator
+    ``simulator`` is a ``Simulator`` where the system is made of encoder, dynamics and renderer, and else another kind
+    of ``AbstractSystem``: which one, only the file knows.
+    """
+
+    simulator: Any
     config: dict[str, Any]
     path: Path
     step: int
@@ -33,8 +37,11 @@ class LoadedModel:
         return str(self.config.get("experiment", "custom"))
 
 
-def load(path: str | Path, device: str | torch.device = "cpu") -> Simulator:
-    """Load the simulator of a checkpoint (or of a run folder: its newest good checkpoint).
+def load(path: str | Path, device: str | torch.device = "cpu") -> Any:
+    """Load the system of a checkpoint, of a run folder (its newest good checkpoint) or of a released folder.
+
+    It is a ``Simulator``, or, where it is not made of encoder, dynamics and renderer, another kind of
+    ``AbstractSystem``.
 
     Only plain tensors and a plain configuration are read, and the configuration is checked against the list of classes
     that may be built, so a checkpoint from elsewhere cannot run code.
@@ -60,24 +67,27 @@ def load_model(
     see ``dynamics.sleeping``); it comes before ``change``, which may then set ``dynamics.rest_speed`` and the like.
 
     Raises:
-        ConfigError: ``change`` names a section or a setting that the model does not have.
+        ConfigError: ``change`` names a section or a setting that the model does not have, or it has no particles that
+            could sleep.
     """
     # Imported here: importing the package must not need Hydra or Lightning.
     from vpd_lightning.config import build_simulator
+    from vpd_lightning.config.building import refuse_references
     from vpd_lightning.config.migrations import changed, upgraded
     from vpd_lightning.config.sleeping import with_sleeping
-    from vpd_lightning.training.checkpoint_io import load_checkpoint
-    from vpd_lightning.training.checkpoints import find_resume
 
     target = find_device(device)
-    path = Path(path).expanduser()
-    if path.is_dir():
-        path = find_resume(path)
-    content = load_checkpoint(path)
-    config = content.get("hyper_parameters")
-    if not isinstance(config, dict) or not isinstance(config.get("scene"), dict):
+    stored = _read(Path(path).expanduser())
+    path = stored.path
+    if not isinstance(stored.config, dict) or not isinstance(stored.config.get("scene"), dict):
         raise CheckpointError(f"{path} does not say what model it holds (no hyper_parameters).\nUse one of vpd-train.")
-    config = upgraded(config)
+    try:  # before anything reads it: a trained configuration holds values, and nothing to look up
+        refuse_references(stored.config, "hyper_parameters")
+    except ConfigError as error:
+        raise CheckpointError(f"{path} may not be loaded.\n{error}") from error
+    config = upgraded(stored.config)
+    if sleeping and not config.get("dynamics"):
+        raise ConfigError(f"sleeping=true needs particles, and {path} has none.\nLeave it away.")
     if sleeping:
         config = with_sleeping(config)
     if change:
@@ -90,11 +100,8 @@ def load_model(
         raise CheckpointError(
             f"{path} describes a model that this version cannot build.\n{str(error).splitlines()[0]}"
         ) from error
-    weights = {
-        name.removeprefix(_PREFIX): value for name, value in content["state_dict"].items() if name.startswith(_PREFIX)
-    }
     try:
-        simulator.load_state_dict(weights)
+        simulator.load_state_dict(stored.weights)
     except RuntimeError as error:
         detail = " ".join(str(error).split())
         if change:
@@ -102,8 +109,39 @@ def load_model(
                 f"change={dict(change)} asks for other weights than {path} holds.\n{detail[:300]}"
             ) from error
         raise CheckpointError(f"The weights in {path} do not fit the model it describes.\n{detail[:300]}") from error
+    return LoadedModel(simulator.to(target).eval(), config, path, stored.step)
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What a file on disk says: weights by their names in the system, and a configuration that nobody checked yet."""
+
+    path: Path
+    weights: Mapping[str, torch.Tensor]
+    config: Any
+    step: int
+
+
+def _read(path: Path) -> _Stored:
+    from vpd_lightning.training.checkpoint_io import load_checkpoint
+    from vpd_lightning.training.checkpoints import find_resume
+
+    if is_release(path):
+        released = read_release(path)
+        return _Stored(released.path, released.weights, released.config, released.step)
+    if path.is_dir():
+        path = find_resume(path)
+    content = load_checkpoint(path)
     step = content.get("global_step", 0)
-    return LoadedModel(simulator.to(target).eval(), config, path, step if isinstance(step, int) else 0)
+    return _Stored(
+        path, simulator_weights(content), content.get("hyper_parameters"), step if isinstance(step, int) else 0
+    )
+
+
+def simulator_weights(content: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """Return the system's own weights of a checkpoint's content, under the names they have in the system."""
+    state = content["state_dict"]
+    return {name.removeprefix(_PREFIX): value for name, value in state.items() if name.startswith(_PREFIX)}
 
 
 def find_device(device: str | torch.device) -> torch.device:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from vpd_lightning.dynamics.base import AbstractDynamics
@@ -13,6 +13,7 @@ from vpd_lightning.encoder.base import AbstractEncoder
 from vpd_lightning.geometry.cameras import pixel_rays
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
+from vpd_lightning.system import AbstractSystem
 from vpd_lightning.types import Cameras, Particles, Rays, RenderedRays, RGBDFrames, SimulatorOutput, VideoBatch
 
 
@@ -24,12 +25,14 @@ class Scene:
     current: Particles
 
 
-class Simulator(nn.Module):
+class Simulator(AbstractSystem):
     """Visual Particle Dynamics (paper section 3): encoder, dynamics and renderer, trained end to end from pixels.
 
     ``location_noise`` is the standard deviation (metres) of the noise on particle positions during training rollouts.
     ``checkpoint_dynamics`` recomputes each dynamics step in the backward pass: exact gradients, less memory.
     """
+
+    num_context_frames = 2
 
     def __init__(
         self,
@@ -104,6 +107,13 @@ class Simulator(nn.Module):
             opacities=restore(rendered.opacities),  # type: ignore[arg-type]
             coarse_rgbs=restore(rendered.coarse_rgbs),
         )
+
+    @torch.no_grad()
+    def predict_frames(self, context: RGBDFrames, cameras: Cameras) -> Float[Tensor, "step view height width 3"]:
+        """Encode the two frames of the input views, roll out, and render step ``i`` from the cameras ``i``."""
+        scene = self.encode(context.rgb, context.depth, context.cameras)
+        states = self.rollout(scene, cameras.shape[0])
+        return torch.cat([self.render([state], cameras[step]) for step, state in enumerate(states)])
 
     # The Python face for people who have a trained model.
 

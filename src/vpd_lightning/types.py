@@ -159,7 +159,8 @@ class VideoBatch(_Border):
     """One training batch: two context frames and the rays to predict.
 
     ``context`` has axes ``batch time=2 view ...``; ``rays`` and ``rgbs`` have axes ``batch time ray 3``, where time
-    counts predicted steps. ``clips`` names each member (``file@start``) for messages.
+    counts predicted steps. ``clips`` names each member (``file@start``) for messages. ``future`` are the frames of the
+    input views at the predicted steps (axes ``batch time view``), for trainings that encode them.
     """
 
     context: RGBDFrames
@@ -167,16 +168,38 @@ class VideoBatch(_Border):
     rgbs: Float[Tensor, "batch time ray 3"]
     keys: RandomKeys
     clips: Sequence[str] = field(default=())
+    future: RGBDFrames | None = None
+
+
+@dataclass(frozen=True)
+class ViewBatch(_Border):
+    """One training batch of single camera views, for systems that have no particles: whole images, no cameras.
+
+    ``images`` are uint8 at the resolution of the system. ``slots`` are stored codes of the same frames, where a system
+    is trained on such; then the frames before ``num_history`` are given and the others are to be predicted.
+    """
+
+    images: UInt8[Tensor, "batch time height width 3"]
+    slots: Float[Tensor, "batch time slot dim"] | None
+    num_history: int
+    keys: RandomKeys
+    clips: Sequence[str] = field(default=())
+
+    @property
+    def rgbs(self) -> Float[Tensor, "batch time pixel 3"]:
+        """Colours in [0, 1] of the frames that supervise: all of them, or with slots those behind the history."""
+        shown = self.images if self.slots is None else self.images[:, self.num_history :]
+        return shown.flatten(2, 3).float() / 255.0
 
 
 @dataclass(frozen=True)
 class SimulatorOutput(_Border):
-    """What one forward pass of the simulator gives to the losses.
+    """What one forward pass of a system gives to the losses.
 
-    ``rendered`` has axes ``batch time ray``; ``states`` are the predicted particles, one per step; ``auxiliary`` holds
-    what an encoder offers beside particles (for example predicted depth).
+    ``rendered`` has axes ``batch time ray`` and is None where no loss looks at colours; ``states`` are the predicted
+    particles, one per step; ``auxiliary`` holds what a stage offers beside that (for example predicted depth).
     """
 
-    rendered: RenderedRays
+    rendered: RenderedRays | None
     states: Sequence[Particles]
     auxiliary: dict[str, Tensor] = field(default_factory=dict)

@@ -4,9 +4,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import IO
 
 import pytest
 
+from vpd_lightning.commands import run_claim
 from vpd_lightning.commands.run_claim import CLAIM, claimed, foreign_files, is_claimed, set_aside
 from vpd_lightning.errors import ConfigError
 
@@ -45,6 +47,24 @@ def test_two_runs_that_choose_one_name_at_the_same_moment_do_not_mix(tmp_path: P
         claimed(tmp_path / "run", is_new=True),
     ):
         pass
+
+
+@pytest.mark.parametrize("is_new", [True, False])
+def test_claim_that_is_removed_before_it_is_locked_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_new: bool
+):
+    calls = []
+
+    def lock_late(stream: IO[str]) -> bool:
+        calls.append(stream)
+        if len(calls) == 1:  # the owner before ends just now
+            (tmp_path / CLAIM).unlink()
+        return True
+
+    monkeypatch.setattr(run_claim, "lock", lock_late)
+    with claimed(tmp_path, is_new=is_new):
+        assert (tmp_path / CLAIM).read_text() == f"{os.getpid()}\n"
+    assert len(calls) == 2 and calls[0].closed
 
 
 def test_folder_is_set_aside_under_the_first_free_name(tmp_path: Path):

@@ -50,6 +50,35 @@ def test_class_from_elsewhere_is_refused_before_anything_runs(target: Any):
         build({"_target_": target}, None, "loss.pixel")
 
 
+@pytest.mark.parametrize("target", ["torch.optim.Adam", "lightning.pytorch.callbacks.ModelCheckpoint"])
+def test_a_system_is_built_of_our_own_classes_only(target: str):
+    config = compose("train", ["experiment=tiny"])
+    config["encoder"]["background"] = {"_target_": target}
+
+    with pytest.raises(ConfigError, match=r"encoder.background._target_=.* may not be built"):
+        build_simulator(config)
+
+
+PAYLOAD = "${oc.create:{_target_:pathlib.Path.touch,self:{_target_:pathlib.Path,_args_:[FILE]}}}"
+
+
+@pytest.mark.parametrize("reference", [PAYLOAD, "${oc.env:HOME}", "a ${b", "\\${c}"])
+def test_references_are_refused_before_anything_follows_them(tmp_path, reference: str):
+    reference = reference.replace("FILE", str(tmp_path / "hacked"))
+    whole = {"_target_": "vpd_lightning.losses.pixel.PixelLoss", "weight": 1.0, "coarse_weight": 1.0}
+    for section in (
+        {**whole, "weight": reference},
+        {**whole, "weight": [1.0, {"a": (reference,)}]},
+        {**whole, "weight": {reference: 1.0}},
+        {**whole, reference: 1.0},
+    ):
+        with pytest.raises(ConfigError, match="holds a reference"):
+            build(section, None, "loss.pixel")
+        with pytest.raises(ConfigError, match="holds a reference"):
+            check_targets(section, "loss.pixel")
+    assert not (tmp_path / "hacked").exists()
+
+
 def test_nested_class_from_elsewhere_is_refused():
     config = compose("train", ["experiment=tiny"])
     config["encoder"]["background"] = {"_target_": "os.system", "command": "true"}

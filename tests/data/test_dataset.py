@@ -42,6 +42,7 @@ def dataset(trajectories: Sequence[TrajectoryFrames], **changes: Any) -> ClipDat
         "target_views": [0, 1],
         "start_frames": None,
         "moving_rays": None,
+        "load_future": False,
     }
     return ClipDataset(**{**settings, **changes})
 

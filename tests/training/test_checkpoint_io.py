@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 import torch
 
+from vpd_lightning.config.pretraining import FOLDER
 from vpd_lightning.errors import CheckpointError
 from vpd_lightning.training.checkpoint_io import AtomicCheckpointIO, load_checkpoint, write_checkpoint
-from vpd_lightning.training.checkpoints import find_resume, latest_run
+from vpd_lightning.training.checkpoints import FIRST_TRAINING, find_resume, latest_run
 
 
 def content(value: float = 1.0) -> dict[str, Any]:
@@ -186,3 +187,9 @@ def test_the_latest_run_is_the_one_that_saved_last(tmp_path: Path) -> None:
         write_checkpoint(content(), path)
         os.utime(path, (1000 + index, 1000 + index))
     assert latest_run(tmp_path) == tmp_path / "a"
+
+    assert FIRST_TRAINING == FOLDER  # of a run that was stopped in the first of two trainings
+    path = tmp_path / "b" / FIRST_TRAINING / "checkpoints" / "last.ckpt"
+    write_checkpoint(content(), path)
+    os.utime(path, (1002, 1002))
+    assert latest_run(tmp_path) == tmp_path / "b"

@@ -146,6 +146,7 @@ def tiny_data(folder: Path, **changes: Any) -> VideoDataModule:
         "num_validation_clips": 2,
         "num_validation_steps": 2,
         "validation_views": [0],
+        "load_future": False,
     }
     return VideoDataModule(**{**settings, **changes})
 

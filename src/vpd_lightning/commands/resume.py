@@ -42,7 +42,7 @@ def resumed_overrides(overrides: Sequence[str]) -> list[str]:
             "Name the folder of a run (resume=runs/EXPERIMENT/RUN), or leave resume away to start anew."
         )
     merged = _as_mapping([*_saved_overrides(folder), *overrides])
-    merged["resume"] = merged["run.folder"] = _quote(str(folder.absolute()))
+    merged["resume"] = merged["run.folder"] = quote(str(folder.absolute()))
     return [f"{key}={value}" for key, value in merged.items()]
 
 
@@ -52,7 +52,14 @@ def wants_auto(overrides: Sequence[str]) -> bool:
 
 
 def has_checkpoint(folder: Path) -> bool:
-    """Whether a run folder holds a checkpoint to go on from."""
+    """Whether a run folder holds a checkpoint to go on from, be it of the first of two trainings."""
+    from vpd_lightning.config.pretraining import FOLDER as FIRST
+
+    return has_own_checkpoint(folder) or has_own_checkpoint(folder / FIRST)
+
+
+def has_own_checkpoint(folder: Path) -> bool:
+    """Whether the training that writes to this very folder has saved a checkpoint."""
     from vpd_lightning.training.checkpoint_io import LAST, PREVIOUS
     from vpd_lightning.training.checkpoints import FOLDER
 
@@ -60,7 +67,7 @@ def has_checkpoint(folder: Path) -> bool:
 
 
 def _youngest_run(root: Path, experiment: str | None) -> Path:
-    from vpd_lightning.training.checkpoints import latest_run
+    from vpd_lightning.training.checkpoints import last_saved, latest_run
 
     folders = [root / _unquote(experiment)] if experiment else sorted(path for path in root.glob("*") if path.is_dir())
     runs = []
@@ -75,7 +82,7 @@ def _youngest_run(root: Path, experiment: str | None) -> Path:
             f"there is nothing to resume in {root.absolute()}.\nNo run{of} there has saved a checkpoint.\n"
             "Leave resume=last away to start a run, or name the folder of one: resume=FOLDER"
         )
-    return max(runs, key=lambda run: max(path.stat().st_mtime for path in run.glob("checkpoints/last*.ckpt")))
+    return max(runs, key=lambda run: last_saved(run) or 0.0)
 
 
 def _as_mapping(overrides: Sequence[str]) -> dict[str, str]:
@@ -106,6 +113,6 @@ def _unquote(value: str) -> str:
     return value[1:-1] if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"" else value
 
 
-def _quote(value: str) -> str:
+def quote(value: str) -> str:
     """Quote what Hydra's grammar would not read as one word."""
     return value if re.fullmatch(r"[\w./-]+", value) else "'" + value.replace("'", "\\'") + "'"

@@ -14,6 +14,7 @@ CLAIM = ".claimed"
 _OWN = (
     CLAIM, "log.txt", "config*.yaml", "environment*.json", "overrides.yaml", "metrics.csv", ".metrics.csv.*.partial",
     "hparams.yaml", "events.out.tfevents.*", "checkpoints", "validation", "wandb",
+    "pretraining", "slots", "training_time.json",
 )  # fmt: skip
 
 
@@ -28,19 +29,37 @@ def claimed(folder: Path, *, is_new: bool) -> Iterator[None]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / CLAIM
-    try:
-        stream = path.open("x" if is_new else "a")
-    except FileExistsError as error:
-        raise ConfigError(f"another run has just taken {folder}.\nStart again, or name another run.folder.") from error
-    with stream:
-        if not _lock(stream):
-            raise ConfigError(f"another process trains in {folder}.\nWait for it, or stop it.")
+    with _locked_file(path, is_new=is_new) as stream:
         stream.write(f"{os.getpid()}\n")
         stream.flush()
         try:
             yield
         finally:
             path.unlink(missing_ok=True)
+
+
+def _locked_file(path: Path, *, is_new: bool) -> IO[str]:
+    """Open and lock the claim that has the path: the owner before may remove its file between the two."""
+    while True:
+        try:
+            stream = path.open("x" if is_new else "a")
+        except FileExistsError as error:
+            raise ConfigError(
+                f"another run has just taken {path.parent}.\nStart again, or name another run.folder."
+            ) from error
+        if not lock(stream):
+            stream.close()
+            raise ConfigError(f"another process trains in {path.parent}.\nWait for it, or stop it.")
+        if _is_at(stream, path):
+            return stream
+        stream.close()
+
+
+def _is_at(stream: IO[str], path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(stream.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def is_claimed(folder: Path) -> bool:
@@ -50,7 +69,7 @@ def is_claimed(folder: Path) -> bool:
     except OSError:
         return False
     with stream:
-        return not _lock(stream)
+        return not lock(stream)
 
 
 def foreign_files(folder: Path) -> list[str]:
@@ -76,14 +95,18 @@ def _aside(folder: Path) -> Iterator[Path]:
     return (folder.with_name(f"{folder.name}.aborted-{number}") for number in count(1))
 
 
-def _lock(stream: IO[str]) -> bool:
-    """Lock a file open for writing until it is closed; False where another process has done so."""
+def lock(stream: IO[str], *, is_patient: bool = False) -> bool:
+    """Lock a file open for writing until it is closed; False where another process has done so.
+
+    ``is_patient`` waits for the other process instead.
+    """
     try:
         import fcntl
     except ImportError:  # no such locks on this system
         return True
     try:
-        fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # unlike flock's, not inherited by loader workers
+        # Unlike flock's, not inherited by loader workers.
+        fcntl.lockf(stream, fcntl.LOCK_EX | (0 if is_patient else fcntl.LOCK_NB))
     except (BlockingIOError, PermissionError):
         return False
     except OSError:  # a file system without locks

@@ -2,11 +2,10 @@
 
 import json
 import logging
-import os
 import shutil
 import signal
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -17,15 +16,17 @@ from lightning.pytorch import Callback, LightningDataModule, Trainer
 from lightning.pytorch.loggers import Logger
 
 from vpd_lightning.commands.environment import environment
-from vpd_lightning.commands.resume import OVERRIDES_FILE
+from vpd_lightning.commands.first_training import FirstTraining, hand_over, train_first
+from vpd_lightning.commands.provide_data import provide_data
+from vpd_lightning.commands.resume import OVERRIDES_FILE, has_own_checkpoint, quote
 from vpd_lightning.commands.run_claim import claimed
-from vpd_lightning.config import build, build_list, build_simulator
-from vpd_lightning.data.manifest import FILE_NAME
-from vpd_lightning.errors import ConfigError, DataError, OutOfMemoryError
+from vpd_lightning.config import build, build_list, build_simulator, compose
+from vpd_lightning.errors import ConfigError, OutOfMemoryError
 from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.randomness import derive_seed
-from vpd_lightning.simulator import Simulator
-from vpd_lightning.training.checkpoint_io import AtomicCheckpointIO
+from vpd_lightning.system import AbstractSystem
+from vpd_lightning.training.checkpoint_io import LAST, AtomicCheckpointIO
+from vpd_lightning.training.checkpoints import FOLDER as CHECKPOINTS
 from vpd_lightning.training.checkpoints import find_resume
 from vpd_lightning.training.module import VPDModule
 from vpd_lightning.training.optimization import AbstractOptimization
@@ -44,85 +45,81 @@ def train_in(folder: Path, config: dict[str, Any], overrides: Sequence[str], *, 
     """
     is_new = is_rank_zero and not config["resume"]
     with claimed(folder, is_new=is_new) if is_rank_zero else nullcontext():
-        _train(folder, config, overrides, is_rank_zero, is_new)
+        try:
+            with _named_memory_errors(), _libraries_in_log():
+                _set_numerics(config)
+                if is_new and config["pretraining"]:  # the first training may end before fit() describes the second
+                    _describe(folder, config, overrides, is_resumed=False)
+                first = train_first(folder, config, overrides, is_rank_zero, fit)
+                # A run that was stopped in its first training has no checkpoint of its own yet.
+                checkpoint = find_resume(folder) if config["resume"] and has_own_checkpoint(folder) else None
+                fit(folder, config, overrides, is_rank_zero, checkpoint, first)
+        except BaseException:
+            if is_new and not any(folder.glob(f"**/{CHECKPOINTS}/*.ckpt")):
+                _forget(folder, overrides)
+            raise
+        if config["evaluate"] and is_rank_zero:
+            evaluate_run(folder, config)
 
 
-def _train(folder: Path, config: dict[str, Any], overrides: Sequence[str], is_rank_zero: bool, is_new: bool) -> None:
-    trainer = None
-    try:
-        with _named_memory_errors(), _libraries_in_log():
-            _set_numerics(config)
-            datamodule, module, trainer, checkpoint = _build_all(folder, config)
-            if is_rank_zero:
-                _describe(folder, config, overrides, checkpoint is not None)
-                print(f"run folder: {folder}", flush=True)
-            with _plain_interrupt(), _named_range_errors(trainer):
-                trainer.fit(module, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
-    except BaseException:
-        if is_new and (trainer is None or trainer.global_step == 0):
-            _forget(folder, overrides)
-        raise
+def evaluate_run(folder: Path, config: Mapping[str, Any]) -> None:
+    """Evaluate the last checkpoint as ``vpd-eval`` does: beside it, where a run that went on has earlier ones."""
+    from vpd_lightning.commands.evaluation_run import run_evaluation
+
+    words = {"ckpt": folder / CHECKPOINTS / LAST, "num_threads": config["num_threads"]}
+    settings = compose("eval", [f"{key}={quote(str(value))}" for key, value in words.items() if value is not None])
+    run_evaluation(settings)
 
 
-def _build_all(folder: Path, config: dict[str, Any]) -> tuple[LightningDataModule, VPDModule, Trainer, Path | None]:
-    checkpoint = find_resume(folder) if config["resume"] else None
-    _provide_data(config)
+def fit(
+    folder: Path,
+    config: dict[str, Any],
+    overrides: Sequence[str],
+    is_rank_zero: bool,
+    checkpoint: Path | None,
+    first: FirstTraining | None,
+) -> None:
+    """Build everything and train: anew, from a checkpoint, or from the weights of a first training."""
+    provide_data(config)
     datamodule = build(config["data"], LightningDataModule, "data")
     datamodule.setup("fit")
-    simulator = _build_simulator(config)
-    _fit_background(simulator, datamodule)
+    system = _build_system(config)
+    _fit_background(system, datamodule)
     module = VPDModule(
-        simulator=simulator,
+        simulator=system,
         losses=build_list(config["loss"], AbstractLoss, "loss"),
         optimization=build(config["optimizer"], AbstractOptimization, "optimizer"),
         config=config,
     )
+    callbacks = build_list(config["callbacks"], Callback, "callbacks")
+    if first is not None:
+        hand_over(first, system, datamodule, callbacks, folder, config)
     trainer = build(
         config["trainer"],
         Trainer,
         "trainer",
         logger=build_list(config["logger"], Logger, "logger") or False,
-        callbacks=build_list(config["callbacks"], Callback, "callbacks"),
+        callbacks=callbacks,
         plugins=[AtomicCheckpointIO()],
     )
-    return datamodule, module, trainer, checkpoint
+    if is_rank_zero:
+        _describe(folder, config, overrides, checkpoint is not None)
+        print(f"run folder: {folder}", flush=True)
+    with _plain_interrupt(), _named_range_errors(trainer):
+        trainer.fit(module, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
 
 
-def _build_simulator(config: dict[str, Any]) -> Simulator:
-    """Build the simulator with initial weights that depend on the seed alone."""
+def _build_system(config: dict[str, Any]) -> AbstractSystem:
+    """Build the system with initial weights that depend on the seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(config["seed"], "weights"))
         return build_simulator(config)
 
 
-def _fit_background(simulator: Simulator, datamodule: Any) -> None:
-    background = simulator.encoder.background
+def _fit_background(system: AbstractSystem, datamodule: Any) -> None:
+    background = getattr(getattr(system, "encoder", None), "background", None)
     if background is not None:
-        background.fit(*datamodule.median_background())  # type: ignore[operator]
-
-
-def _provide_data(config: dict[str, Any]) -> None:
-    """Generate the data set where it is missing and the configuration says so; else say how to get it."""
-    folder, wanted = Path(config["data"]["folder"]), config["generate"]
-    if (folder / FILE_NAME).is_file():
-        return
-    if wanted is None or wanted["scene"] is None:
-        raise DataError(
-            f"there is no data set in {folder} (no {FILE_NAME}).\n"
-            "Point data.folder at one; vpd-data --help says how to generate or import recordings."
-        )
-    command = f"vpd-data generate scene={wanted['scene']} preset={wanted['preset']} out={folder}"
-    if not wanted["when_missing"]:
-        raise DataError(
-            f"there is no data set in {folder} (no {FILE_NAME}).\nMake it: {command}\n"
-            "Or look first whether everything works, with a tiny one that makes itself: budget=tiny"
-        )
-    if int(os.environ.get("LOCAL_RANK", "0")) > 0:
-        raise DataError(f"there is no data set in {folder}.\nMake it before training on several devices: {command}")
-    from data_gen.generate import generate
-
-    print(f"there is no data set in {folder}; making it: {command}", flush=True)
-    generate(scene=wanted["scene"], preset=wanted["preset"], out=folder, seed=wanted["seed"])
+        background.fit(*datamodule.median_background())
 
 
 def _set_numerics(config: dict[str, Any]) -> None:

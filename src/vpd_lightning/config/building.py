@@ -3,7 +3,7 @@
 import inspect
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
@@ -15,16 +15,19 @@ from vpd_lightning.config.plugins import load_plugins
 from vpd_lightning.errors import ConfigError, VPDError
 
 if TYPE_CHECKING:
-    from vpd_lightning.simulator import Simulator
+    from vpd_lightning.system import AbstractSystem
 
 # Only classes defined below these packages may be built; see also the packages of loaded plug-ins.
-ALLOWED_PACKAGES = ("vpd_lightning", "torch.optim", "lightning.pytorch")
+SYSTEM_PACKAGES = ("vpd_lightning",)  # a system and its parts, whose description may come from anywhere
+ALLOWED_PACKAGES = (*SYSTEM_PACKAGES, "torch.optim", "lightning.pytorch")
+_REFERENCE = "${"
 STAGES = {
     "encoder": ("vpd_lightning.encoder.base", "AbstractEncoder"),
     "dynamics": ("vpd_lightning.dynamics.base", "AbstractDynamics"),
     "renderer": ("vpd_lightning.renderer.base", "AbstractRenderer"),
 }
 WHOLE_SYSTEM = ("vpd_lightning.simulator", "Simulator")
+ANY_SYSTEM = ("vpd_lightning.system", "AbstractSystem")
 
 
 def build(section: Mapping[str, Any], expected: type | None, name: str, **more: Any) -> Any:
@@ -40,8 +43,15 @@ def build(section: Mapping[str, Any], expected: type | None, name: str, **more: 
         ConfigError: a class that may not be built, an unknown, missing or mistyped argument, or a value that the
             constructor refuses.
     """
-    check_targets(section, name, given=more)
-    target = _resolve(section["_target_"], name)
+    return _build(section, expected, name, more, ALLOWED_PACKAGES)
+
+
+def _build(
+    section: Mapping[str, Any], expected: type | None, name: str, more: Mapping[str, Any], packages: Sequence[str]
+) -> Any:
+    refuse_references(section, name)
+    _check_targets(section, name, more, packages)
+    target = _resolve(section["_target_"], name, packages)
     if expected is not None and not issubclass(target, expected):
         raise ConfigError(f"{name}._target_ is {section['_target_']}.\nIt must be a kind of {expected.__name__}.")
     try:
@@ -59,25 +69,41 @@ def build_list(section: Mapping[str, Any] | None, expected: type | None, name: s
     return [build(entry, expected, f"{name}.{key}") for key, entry in entries.items()]
 
 
-def build_simulator(config: Mapping[str, Any]) -> "Simulator":
-    """Build the simulator from the sections model, encoder, dynamics and renderer of a plain configuration.
+def build_simulator(config: Mapping[str, Any]) -> "AbstractSystem":
+    """Build the system of a plain configuration: from model, encoder, dynamics and renderer, or from model alone.
 
-    The configuration may come from a checkpoint: it is data, and goes through the same checks.
+    The configuration may come from a checkpoint: it is data, and goes through the same checks; of other packages than
+    ours and plug-ins nothing is built.
 
     Raises:
         ConfigError: see ``build``; also stages whose widths do not fit together.
     """
-    missing = [key for key in ("model", *STAGES) if not isinstance(config.get(key), Mapping)]
+    if not isinstance(config.get("model"), Mapping):
+        raise ConfigError("the configuration has no section model.")
+    if not is_of_stages(config):
+        whole = getattr(import_module(ANY_SYSTEM[0]), ANY_SYSTEM[1])
+        return _build(config["model"], whole, "model", {}, SYSTEM_PACKAGES)
+    missing = [key for key in STAGES if not isinstance(config.get(key), Mapping)]
     if missing:
         raise ConfigError(f"the configuration has no section {' and no section '.join(missing)}.")
     for name, (module, base) in STAGES.items():
         _check_kind(config[name], name, module, base)
     check_widths(config)
     stages = {
-        name: build(config[name], getattr(import_module(module), base), name) for name, (module, base) in STAGES.items()
+        name: _build(config[name], getattr(import_module(module), base), name, {}, SYSTEM_PACKAGES)
+        for name, (module, base) in STAGES.items()
     }
     module, base = WHOLE_SYSTEM
-    return build(config["model"], getattr(import_module(module), base), "model", **stages)
+    return _build(config["model"], getattr(import_module(module), base), "model", stages, SYSTEM_PACKAGES)
+
+
+def is_of_stages(config: Mapping[str, Any]) -> bool:
+    """Whether the system is made of encoder, dynamics and renderer (else its section ``model`` says everything)."""
+    section = config["model"]
+    if "_target_" not in section:
+        raise ConfigError("model names no class.\nIts section needs a key _target_.")
+    module, base = WHOLE_SYSTEM
+    return issubclass(_resolve(section["_target_"], "model", SYSTEM_PACKAGES), getattr(import_module(module), base))
 
 
 def check_widths(config: Mapping[str, Any]) -> None:
@@ -86,8 +112,9 @@ def check_widths(config: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: they do not.
     """
-    widths = {f"{name}.feature_dim": config[name]["feature_dim"] for name in STAGES if "feature_dim" in config[name]}
-    channels = config["encoder"].get("channels")
+    sections = {name: config.get(name) or {} for name in STAGES}
+    widths = {f"{name}.feature_dim": part["feature_dim"] for name, part in sections.items() if "feature_dim" in part}
+    channels = sections["encoder"].get("channels")
     if channels:
         widths["encoder.channels[-1]"] = channels[-1]
     if len(set(widths.values())) > 1:
@@ -102,42 +129,68 @@ def check_targets(node: Any, name: str, given: Mapping[str, Any] | None = None) 
     """Check every class named below ``node`` and the arguments given to it, without building anything.
 
     Raises:
-        ConfigError: a class that may not be built, or an unknown, missing or mistyped argument.
+        ConfigError: a class that may not be built, an unknown, missing or mistyped argument, or a reference (``${``):
+            configurations are resolved before, and ``instantiate`` would resolve this one after the check, to anything.
     """
+    refuse_references(node, name)
+    _check_targets(node, name, given or {}, ALLOWED_PACKAGES)
+
+
+def _check_targets(node: Any, name: str, given: Mapping[str, Any], packages: Sequence[str]) -> None:
     if isinstance(node, Mapping):
         if "_target_" in node:
-            _check_arguments(_resolve(node["_target_"], name), node, name, given or {})
+            _check_arguments(_resolve(node["_target_"], name, packages), node, name, given)
         for key, value in node.items():
-            check_targets(value, f"{name}.{key}")
+            _check_targets(value, f"{name}.{key}", {}, packages)
     elif isinstance(node, Sequence) and not isinstance(node, str):
         for index, value in enumerate(node):
-            check_targets(value, f"{name}[{index}]")
+            _check_targets(value, f"{name}[{index}]", {}, packages)
+
+
+def refuse_references(node: Any, name: str) -> None:
+    """Refuse every string below ``node``, keys included, that something would resolve (``${``).
+
+    Raises:
+        ConfigError: there is one.
+    """
+    if isinstance(node, str) and _REFERENCE in node:
+        raise ConfigError(
+            f"{name} holds a reference, which would be followed behind the check of what may be built.\n"
+            f"Given: {node[:80]!r}. Write the value itself."
+        )
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            refuse_references(key, name)
+            refuse_references(value, f"{name}.{key}")
+    elif isinstance(node, Sequence | Set) and not isinstance(node, str | bytes):
+        for index, value in enumerate(node):
+            refuse_references(value, f"{name}[{index}]")
 
 
 def _check_kind(section: Mapping[str, Any], name: str, module: str, base: str) -> None:
     if "_target_" not in section:
         raise ConfigError(f"{name} names no class.\nIts section needs a key _target_.")
-    target = _resolve(section["_target_"], name)
+    target = _resolve(section["_target_"], name, SYSTEM_PACKAGES)
     if not issubclass(target, getattr(import_module(module), base)):
         raise ConfigError(f"{name}._target_ is {section['_target_']}.\nIt must be a kind of {base}.")
 
 
-def _is_allowed(path: str) -> bool:
-    packages = (*ALLOWED_PACKAGES, *load_plugins().packages)
+def _is_below(path: str, packages: Sequence[str]) -> bool:
     return any(path.startswith(f"{package}.") for package in packages)
 
 
-def _resolve(target: Any, name: str) -> type:
+def _resolve(target: Any, name: str, packages: Sequence[str]) -> type:
     """Return the class behind a dotted path; its own module must be allowed too, not only the path that leads there."""
+    allowed = (*packages, *load_plugins().packages)
     refusal = ConfigError(
         f"{name}._target_={target} may not be built.\n"
-        f"Allowed are classes of {', '.join((*ALLOWED_PACKAGES, *load_plugins().packages))}.\n"
+        f"Allowed are classes of {', '.join(allowed)}.\n"
         "Another package joins through the entry-point group vpd_lightning.plugins."
     )
-    if not isinstance(target, str) or not _is_allowed(target):
+    if not isinstance(target, str) or not _is_below(target, allowed):
         raise refusal
     found = _locate(target, name)
-    if not isinstance(found, type) or not _is_allowed(f"{found.__module__}."):
+    if not isinstance(found, type) or not _is_below(f"{found.__module__}.", allowed):
         raise refusal
     return found
 

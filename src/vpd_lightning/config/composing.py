@@ -21,6 +21,7 @@ from vpd_lightning.config.run_folders import register_resolvers
 from vpd_lightning.config.schema import (
     BenchConfig,
     EvalConfig,
+    ExportConfig,
     RenderConfig,
     TrainConfig,
     check_scene,
@@ -28,7 +29,13 @@ from vpd_lightning.config.schema import (
 )
 from vpd_lightning.errors import ConfigError
 
-SCHEMAS: dict[str, type] = {"train": TrainConfig, "eval": EvalConfig, "render": RenderConfig, "bench": BenchConfig}
+SCHEMAS: dict[str, type] = {
+    "train": TrainConfig,
+    "eval": EvalConfig,
+    "render": RenderConfig,
+    "bench": BenchConfig,
+    "export": ExportConfig,
+}
 
 
 def prepare() -> None:
@@ -79,19 +86,37 @@ def plain(config: Any) -> dict[str, Any]:
 def expand_sweep(command: str, overrides: Sequence[str], config_dir: str | Path | None = None) -> list[list[str]]:
     """Return the overrides of every job of a sweep, in the order of Hydra's own sweeper.
 
+    As there, what the configuration lists under ``hydra.sweeper.params`` (a file of ``conf/sweep`` does) comes first,
+    and a word of the same key on the command line replaces it.
+
     Raises:
         ConfigError: a word cannot be read, or bypasses the schema.
     """
     refuse_bypasses(overrides)
     try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
-        jobs = [override for override in parsed if not override.is_hydra_override()]
+        parser = OverridesParser.create()
+        words = [*sweep_parameters(command, overrides, config_dir), *overrides]
+        refuse_bypasses(words)
+        jobs = [override for override in parser.parse_overrides(words) if not override.is_hydra_override()]
         return BasicSweeper.split_arguments(jobs, max_batch_size=None)[0]
     except HydraException as error:
         raise explain(error, command, overrides, lambda words: _compose(command, words, config_dir)) from error
 
 
-def _compose(command: str, overrides: Sequence[str], config_dir: str | Path | None) -> Any:
+def sweep_parameters(command: str, overrides: Sequence[str], config_dir: str | Path | None = None) -> list[str]:
+    """Return what the configuration itself lists under ``hydra.sweeper.params``, as words of a command line.
+
+    Raises:
+        ConfigError: the words that are the same for all jobs cannot be composed.
+    """
+    prepare()
+    parser = OverridesParser.create()
+    fixed = [word for word in overrides if not parser.parse_override(word).is_sweep_override()]
+    config = _compose(command, fixed, config_dir, with_hydra=True)
+    return [f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()]
+
+
+def _compose(command: str, overrides: Sequence[str], config_dir: str | Path | None, *, with_hydra: bool = False) -> Any:
     """Compose with Hydra; leaves a Hydra that is already running (a job of its own) as it was."""
     folders = [str(folder) for folder in load_plugins().config_folders]
     if config_dir is not None:
@@ -103,7 +128,7 @@ def _compose(command: str, overrides: Sequence[str], config_dir: str | Path | No
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(config_folder()), version_base="1.3"):
-            return hydra_compose(command, words)
+            return hydra_compose(command, words, return_hydra_config=with_hydra)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise explain(error, command, overrides, lambda fewer: _compose(command, fewer, config_dir)) from error
     finally:

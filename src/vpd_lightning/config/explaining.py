@@ -114,6 +114,8 @@ def _explain_unknown_key(
     guess = ""
     try:
         others = [word for word in overrides if "." not in word.partition("=")[0] and not word.startswith(key)]
+        if len(others) == len(overrides):  # an option's own fault: fewer words would end here again
+            return ConfigError(f"{cause.splitlines()[0]}\nThe options chosen do not fit together; leave one away.")
         known = list(keys_of(compose(others)))
         guess = _nearest_key(key, known)
     except ConfigError:

@@ -8,6 +8,7 @@ from vpd_lightning.errors import ConfigError
 
 _RENDERER = "vpd_lightning.renderer."
 _DYNAMICS = "vpd_lightning.dynamics."
+_PLAIN_FEATURES = {"kernel_normalization": None, "normalization_epsilon": 1e-6, "feature_network": None}
 
 ADDED_SETTINGS: dict[str, dict[str, Any]] = {
     # All of these say how fast something is computed, or leave something out that the model was not trained with.
@@ -19,6 +20,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "early_stop": 0.0,
         "num_stop_segments": 4,
         "share_rows_below": None,
+        **_PLAIN_FEATURES,
     },
     f"{_DYNAMICS}hierarchical_gnn.HierarchicalGNNDynamics": {
         "edge_capacity": None,
@@ -26,13 +28,13 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "max_abstract_edges_per_node": None,
         "feature_limit": 1e4,
     },
-    f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto"},
+    f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},
     f"{_RENDERER}splat.SplatRenderer": {"candidate_backend": "auto"},
 }
 """By class: arguments added since the first checkpoints, with values that leave those models as they were."""
 
 
-def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
+def upgraded(config: Mapping[Any, Any]) -> dict[Any, Any]:
     """Return a stored configuration with the settings added that its classes have got since; values given stay."""
     result = {}
     for name, section in config.items():

@@ -1,7 +1,12 @@
-"""Names of run folders: ``<root>/<experiment>/<timestamp>_<hash of overrides>``, chosen once, by rank 0."""
+"""Names of run folders, chosen once, by rank 0.
+
+``<root>/<experiment>/<timestamp>_<hash of overrides>``; a job of a named sweep has a place that follows from its words:
+``<root>/sweeps/<sweep>/<experiment>/<slug of overrides>``.
+"""
 
 import hashlib
 import os
+import re
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
@@ -10,6 +15,10 @@ from omegaconf import OmegaConf
 
 # Rank 0 tells the processes it starts where the run lies.
 ENVIRONMENT = "VPD_RUN_FOLDER"
+# What a job's place says already, or what does not change what comes out.
+_UNNAMED = ("sweep", "sweep_name", "experiment", "resume", "evaluate", "num_threads", "debug")
+_UNNAMED_SECTIONS = ("run.", "hydra.", "hydra/")
+_MAX_SLUG = 100
 
 
 def register_resolvers() -> None:
@@ -31,3 +40,35 @@ def choose_run_folder(folder: str | None, root: str, experiment: str, overrides:
     while chosen.exists():
         chosen, count = parent / f"{name}_{count}", count + 1
     return str(chosen)
+
+
+def sweep_folder(root: str, sweep: str) -> Path:
+    """Return the absolute folder of a named sweep."""
+    return Path(root).expanduser().absolute() / "sweeps" / sweep
+
+
+def sweep_slug(overrides: Sequence[str], parameters: Sequence[str]) -> str:
+    """Return the name of a sweep job's folder: its overrides, readable, the sweep's own parameters first.
+
+    The order of ``overrides`` does not matter. Words that differ give names that differ: where letters had to be
+    replaced or cut off, a hash of all words ends the name.
+
+    Args:
+        overrides: the words of the job.
+        parameters: the keys that the sweep itself lists.
+    """
+    told = {word.partition("=")[0]: word for word in sorted(overrides) if _is_named(word.partition("=")[0])}
+    keys = [key for key in parameters if key in told]
+    keys += [key for key in told if key not in keys]
+    if not keys:
+        return "default"
+    raw = "__".join("-".join(told[key].split("=", 1)) for key in keys)
+    slug = re.sub(r"[^\w.+-]+", "-", raw, flags=re.ASCII)
+    if slug == raw and len(slug) <= _MAX_SLUG:
+        return slug
+    digest = hashlib.sha256("\n".join(told[key] for key in keys).encode()).hexdigest()[:8]
+    return f"{slug[:_MAX_SLUG].strip('-_')}_{digest}"
+
+
+def _is_named(key: str) -> bool:
+    return key not in _UNNAMED and not key.startswith(_UNNAMED_SECTIONS)

@@ -53,12 +53,29 @@ class GenerateConfig:
 
 
 @dataclass
+class PretrainingConfig:
+    """A training that comes first and hands its weights on; ``settings`` replace those of the main one.
+
+    ``ckpt`` names one that is done already; ``share`` is its share of the time budget.
+    """
+
+    ckpt: str | None = None
+    share: float = MISSING
+    settings: Any = MISSING
+
+
+@dataclass
 class TrainConfig:
     """Root of ``vpd-train``."""
 
     experiment: str = MISSING
+    system: str = MISSING
+    evaluate: bool = MISSING
+    sweep_name: str | None = None
+    pretraining: PretrainingConfig | None = None
     seed: int = MISSING
     feature_dim: int = MISSING
+    checkpoint_dynamics: bool = MISSING
     float32_matmul_precision: str = MISSING
     deterministic: bool = MISSING
     num_threads: int | None = None
@@ -68,9 +85,9 @@ class TrainConfig:
     model: Any = MISSING
     scene: SceneConfig = MISSING
     data: Any = MISSING
-    encoder: Any = MISSING
-    dynamics: Any = MISSING
-    renderer: Any = MISSING
+    encoder: Any = None
+    dynamics: Any = None
+    renderer: Any = None
     loss: Any = MISSING
     optimizer: Any = MISSING
     trainer: Any = MISSING
@@ -111,6 +128,7 @@ class EvalConfig:
     ckpt: str = MISSING
     change: Any = None
     sleeping: bool = MISSING
+    hide_depth: bool = MISSING
     data: DataChoice = MISSING
     out: str | None = None
     device: str = MISSING
@@ -140,6 +158,17 @@ class RenderConfig:
     save_particles: list[str] = MISSING
     device: str = MISSING
     num_threads: int | None = None
+    debug: bool = MISSING
+
+
+@dataclass
+class ExportConfig:
+    """Root of ``vpd-export``."""
+
+    ckpt: str = MISSING
+    out: str = MISSING
+    metrics: str | None = None
+    max_megabytes: float = MISSING
     debug: bool = MISSING
 
 
@@ -213,6 +242,9 @@ def check_training(config: dict[str, Any]) -> None:
         precision in ("highest", "high", "medium"), "float32_matmul_precision", precision, "highest, high or medium"
     )
     name = config["experiment"]
+    pretraining = config["pretraining"]
+    if pretraining is not None:
+        _require(0 < pretraining["share"] < 1, "pretraining.share", pretraining["share"], "between 0 and 1")
     plain_name = bool(name) and name == name.strip(".") and all(c.isalnum() or c in "_-." for c in name)
     _require(plain_name, "experiment", name, "a name of letters, digits, _ and - (it becomes a folder)")
 

@@ -10,10 +10,15 @@ from torch import Tensor
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Cameras, Rays, RGBDFrames, VideoBatch
 
+NUM_CONTEXT_FRAMES = 2
+
 
 @dataclass(frozen=True)
 class ClipSample:
-    """One member of a batch, as a loader worker makes it; ``step`` and ``sample_index`` say which one."""
+    """One member of a batch, as a loader worker makes it; ``step`` and ``sample_index`` say which one.
+
+    The time axis holds the two context frames, and behind them the frames to predict where those are loaded.
+    """
 
     rgb: UInt8[Tensor, "time view height width 3"]
     depth: Float[Tensor, "time view height width"]
@@ -39,8 +44,11 @@ def collate_clips(samples: Sequence[ClipSample]) -> VideoBatch:
 
     height, width = samples[0].depth.shape[-2:]
     cameras = Cameras(stack("intrinsics"), stack("cam_to_world"), height, width)
+    frames = RGBDFrames(stack("rgb"), stack("depth"), cameras)
+    has_future = frames.depth.shape[1] > NUM_CONTEXT_FRAMES
     return VideoBatch(
-        context=RGBDFrames(stack("rgb"), stack("depth"), cameras),
+        context=frames[:, :NUM_CONTEXT_FRAMES],
+        future=frames[:, NUM_CONTEXT_FRAMES:] if has_future else None,
         rays=Rays(stack("origins"), stack("directions")),
         rgbs=stack("rgbs"),
         keys=RandomKeys(samples[0].seed, samples[0].step, [sample.sample_index for sample in samples]),

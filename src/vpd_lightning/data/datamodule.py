@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from vpd_lightning.data.background import median_images
-from vpd_lightning.data.collate import collate_clips
+from vpd_lightning.data.collate import NUM_CONTEXT_FRAMES, collate_clips
 from vpd_lightning.data.dataset import ClipDataset, MovingRays
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.manifest import load_manifest
@@ -29,7 +29,8 @@ class VideoDataModule(pl.LightningDataModule):
     maps fractions of the training to rollout lengths and overrides ``num_steps`` in training (null: no schedule).
     ``moving_ray_fraction`` of the rays goes to pixels that differ from the per-camera training median by more than
     the thresholds (largest colour channel, in [0, 1]; depth, in metres). With ``cache`` decoded frames stay in memory
-    (in each loader worker; with the demo's small images use ``num_workers=0``).
+    (in each loader worker; with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
+    the input views' images of the frames to predict.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class VideoDataModule(pl.LightningDataModule):
         num_validation_clips: int,
         num_validation_steps: int,
         validation_views: Sequence[int] | None,
+        load_future: bool,
     ) -> None:
         """Check the numbers; files are first touched by ``setup``."""
         super().__init__()
@@ -72,7 +74,8 @@ class VideoDataModule(pl.LightningDataModule):
         self.moving_color_threshold, self.moving_depth_threshold = moving_color_threshold, moving_depth_threshold
         self.cache = cache
         self.num_validation_clips, self.num_validation_steps = num_validation_clips, num_validation_steps
-        self.validation_views = validation_views
+        self.validation_views, self.load_future = validation_views, load_future
+        self.num_context_frames = NUM_CONTEXT_FRAMES
         self.trajectories: list[TrajectoryFrames] = []
         self.validation: ValidationClips | None = None
         self._medians: dict[int, tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]] = {}
@@ -95,11 +98,15 @@ class VideoDataModule(pl.LightningDataModule):
             self.validation = ValidationClips(
                 trajectories=[TrajectoryFrames(path, use_cache=False) for path in held_out],
                 num_clips=self.num_validation_clips,
+                num_context_frames=self.num_context_frames,
                 num_steps=self.num_validation_steps,
-                input_views=self.input_views,
+                input_views=self._context_views(),
                 target_views=self._views(self.validation_views),
                 start_frames=self.start_frames,
             )
+
+    def _context_views(self) -> list[int]:
+        return self.input_views
 
     def _views(self, views: Sequence[int] | None) -> list[int]:
         return list(range(self.trajectories[0].num_views)) if views is None else list(views)
@@ -137,6 +144,7 @@ class VideoDataModule(pl.LightningDataModule):
             target_views=target_views,
             start_frames=self.start_frames,
             moving_rays=moving_rays,
+            load_future=self.load_future,
         )
 
     def train_dataloader(self) -> DataLoader[VideoBatch]:
@@ -175,7 +183,7 @@ class VideoDataModule(pl.LightningDataModule):
             ),
             collate_fn=collate_clips,
             num_workers=self.num_workers,
-            worker_init_fn=_one_thread,
+            worker_init_fn=one_thread,
         )
 
     def val_dataloader(self) -> DataLoader[VideoClip] | list[DataLoader[VideoClip]]:
@@ -210,6 +218,6 @@ def _unchanged(clip: VideoClip) -> VideoClip:
     return clip
 
 
-def _one_thread(worker: int) -> None:
+def one_thread(worker: int) -> None:
     """Loader workers share the machine with the training: one thread each."""
     torch.set_num_threads(1)

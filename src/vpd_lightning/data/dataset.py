@@ -8,14 +8,12 @@ import torch
 from jaxtyping import Float32, Int, UInt8
 from torch.utils.data import Dataset
 
-from vpd_lightning.data.collate import ClipSample
+from vpd_lightning.data.collate import NUM_CONTEXT_FRAMES, ClipSample
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.errors import DataError
 from vpd_lightning.geometry.cameras import rays_through
 from vpd_lightning.randomness import numpy_generator
 from vpd_lightning.types import Cameras
-
-NUM_CONTEXT_FRAMES = 2
 
 
 @dataclass(frozen=True)
@@ -64,6 +62,7 @@ class ClipDataset(Dataset[ClipSample]):
 
     A sample is a clip of T + 2 frames of a trajectory: frames ``start`` and ``start + 1`` of the input views as
     context, and rays of frames ``start + 2 ... start + 1 + T`` of the target views with the colours seen along them.
+    With ``load_future`` the input views' images of those frames come too.
     """
 
     def __init__(
@@ -80,6 +79,7 @@ class ClipDataset(Dataset[ClipSample]):
         target_views: Sequence[int],
         start_frames: Sequence[int] | None,
         moving_rays: MovingRays | None,
+        load_future: bool,
     ) -> None:
         """Check that every trajectory has the frames, views and image size that the clips need.
 
@@ -105,7 +105,7 @@ class ClipDataset(Dataset[ClipSample]):
         self.num_steps_schedule = dict(num_steps_schedule) if num_steps_schedule else None
         self.input_views, self.target_views = list(input_views), list(target_views)
         self.start_frames = None if start_frames is None else list(start_frames)
-        self.moving_rays = moving_rays
+        self.moving_rays, self.load_future = moving_rays, load_future
         self._moving_pixels: dict[tuple[int, int], np.ndarray] = {}
         longest = max([num_steps, *(num_steps_schedule or {}).values()])
         require_clips(self.trajectories, longest, [*self.input_views, *self.target_views], self.start_frames)
@@ -123,18 +123,16 @@ class ClipDataset(Dataset[ClipSample]):
             start = int(draw.integers(trajectory.num_frames - NUM_CONTEXT_FRAMES - num_steps + 1))
         else:
             start = self.start_frames[int(draw.integers(len(self.start_frames)))]
-        context = range(start, start + NUM_CONTEXT_FRAMES)
-        intrinsics, cam_to_world = trajectory.cameras(context, self.input_views)
+        targets = range(start + NUM_CONTEXT_FRAMES, start + NUM_CONTEXT_FRAMES + num_steps)
+        frames = range(start, targets.stop if self.load_future else targets.start)
+        intrinsics, cam_to_world = trajectory.cameras(frames, self.input_views)
 
         rays = numpy_generator(self.seed, step, sample_index, "rays")
-        targets = [
-            self._target_rays(index, time, rays)
-            for time in range(start + NUM_CONTEXT_FRAMES, start + NUM_CONTEXT_FRAMES + num_steps)
-        ]
-        origins, directions, rgbs = (torch.stack(parts) for parts in zip(*targets, strict=True))
+        drawn = [self._target_rays(index, time, rays) for time in targets]
+        origins, directions, rgbs = (torch.stack(parts) for parts in zip(*drawn, strict=True))
         return ClipSample(
-            rgb=torch.from_numpy(trajectory.rgb(context, self.input_views)),
-            depth=torch.from_numpy(trajectory.depth(context, self.input_views)),
+            rgb=torch.from_numpy(trajectory.rgb(frames, self.input_views)),
+            depth=torch.from_numpy(trajectory.depth(frames, self.input_views)),
             intrinsics=torch.from_numpy(intrinsics).float(),
             cam_to_world=torch.from_numpy(cam_to_world).float(),
             origins=origins,
@@ -184,7 +182,11 @@ class ClipDataset(Dataset[ClipSample]):
 
 
 def require_clips(
-    trajectories: Sequence[TrajectoryFrames], num_steps: int, views: Sequence[int], start_frames: Sequence[int] | None
+    trajectories: Sequence[TrajectoryFrames],
+    num_steps: int,
+    views: Sequence[int],
+    start_frames: Sequence[int] | None,
+    num_context_frames: int = NUM_CONTEXT_FRAMES,
 ) -> None:
     """Raise DataError unless every trajectory holds the frames, the views and the image size of the first one."""
     if not trajectories:
@@ -192,12 +194,12 @@ def require_clips(
             "There is no trajectory in this split.\nGenerate the data set again, or point data.folder elsewhere."
         )
     first = trajectories[0]
-    needed = NUM_CONTEXT_FRAMES + num_steps + max(start_frames or [0])
+    needed = num_context_frames + num_steps + max(start_frames or [0])
     for item in trajectories:
         if item.num_frames < needed:
             raise DataError(
                 f"{item.path}: {item.num_frames} frames, but a clip needs {needed}"
-                f" ({NUM_CONTEXT_FRAMES} context frames + {num_steps} steps from frame {max(start_frames or [0])}).\n"
+                f" ({num_context_frames} context frames + {num_steps} steps from frame {max(start_frames or [0])}).\n"
                 "Lower data.num_steps or data.start_frames, or use longer trajectories."
             )
         wrong = sorted({view for view in views if not 0 <= view < item.num_views})

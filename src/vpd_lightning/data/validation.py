@@ -7,14 +7,16 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset
 
-from vpd_lightning.data.dataset import NUM_CONTEXT_FRAMES, require_clips
+from vpd_lightning.data.dataset import require_clips
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.types import Cameras, RGBDFrames
+
+_LONGEST_HISTORY = 6  # frames; of SlotFormer, the system that is shown most
 
 
 @dataclass(frozen=True)
 class VideoClip:
-    """Two context frames (axes ``time=2 view``) and the frames after them (axes ``time view``)."""
+    """Context frames (two, or as many as the system needs) and the frames after them (axes ``time view``)."""
 
     context: RGBDFrames
     target: RGBDFrames
@@ -26,28 +28,38 @@ class VideoClip:
 
 
 class ValidationClips(Dataset[VideoClip]):
-    """Clip ``i`` is the i-th of an even spread over the trajectories and over the start frames that leave room."""
+    """Clip ``i`` is the i-th of an even spread over the trajectories and over the start frames that leave room.
+
+    Where no ``start_frames`` are given, systems that are shown more frames than others predict the same ones: the first
+    predicted frame is frame 6 or later, unless the recordings are too short for as many different clips.
+    """
 
     def __init__(
         self,
         *,
         trajectories: Sequence[TrajectoryFrames],
         num_clips: int,
+        num_context_frames: int,
         num_steps: int,
         input_views: Sequence[int],
         target_views: Sequence[int],
         start_frames: Sequence[int] | None,
     ) -> None:
-        require_clips(trajectories, num_steps, [*input_views, *target_views], start_frames)
-        self.num_steps = num_steps
+        require_clips(trajectories, num_steps, [*input_views, *target_views], start_frames, num_context_frames)
+        self.num_context_frames, self.num_steps = num_context_frames, num_steps
         self.input_views, self.target_views = list(input_views), list(target_views)
         self.clips: list[tuple[TrajectoryFrames, int]] = []
         for index in range(num_clips):
             lap, place = divmod(index, len(trajectories))
             laps = -(-num_clips // len(trajectories))
             trajectory = trajectories[place]
-            latest = trajectory.num_frames - NUM_CONTEXT_FRAMES - num_steps
-            starts = list(range(latest + 1)) if start_frames is None else list(start_frames)
+            if start_frames is not None:
+                starts = list(start_frames)
+            else:
+                latest = trajectory.num_frames - num_steps
+                is_long = latest - _LONGEST_HISTORY + 1 >= laps  # the same answer for all systems
+                earliest = max(num_context_frames, _LONGEST_HISTORY if is_long else 0)
+                starts = [first - num_context_frames for first in range(earliest, latest + 1)]
             self.clips.append((trajectory, starts[lap * len(starts) // laps]))
 
     def __len__(self) -> int:
@@ -55,7 +67,7 @@ class ValidationClips(Dataset[VideoClip]):
 
     def __getitem__(self, index: int) -> VideoClip:
         trajectory, start = self.clips[index]
-        first_target = start + NUM_CONTEXT_FRAMES
+        first_target = start + self.num_context_frames
         return VideoClip(
             context=_frames(trajectory, range(start, first_target), self.input_views),
             target=_frames(trajectory, range(first_target, first_target + self.num_steps), self.target_views),

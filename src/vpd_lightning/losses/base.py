@@ -14,6 +14,11 @@ class AbstractLoss(nn.Module, ABC):
     name: str
     weight: float
 
+    @property
+    def measured(self) -> dict[str, Tensor]:
+        """What the last call measured beside its value, by the name under which it is logged; without gradients."""
+        return {}
+
     @abstractmethod
     def forward(self, output: SimulatorOutput, batch: VideoBatch) -> Float[Tensor, ""]:
         """Return the unweighted value."""

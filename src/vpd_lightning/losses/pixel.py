@@ -3,8 +3,9 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from vpd_lightning.errors import ConfigError
 from vpd_lightning.losses.base import AbstractLoss
-from vpd_lightning.types import SimulatorOutput, VideoBatch
+from vpd_lightning.types import SimulatorOutput, VideoBatch, ViewBatch
 
 
 class PixelLoss(AbstractLoss):
@@ -18,8 +19,10 @@ class PixelLoss(AbstractLoss):
             raise ValueError(f"weights must not be negative, got weight={weight}, coarse_weight={coarse_weight}")
         self.weight, self.coarse_weight = weight, coarse_weight
 
-    def forward(self, output: SimulatorOutput, batch: VideoBatch) -> Float[Tensor, ""]:
+    def forward(self, output: SimulatorOutput, batch: VideoBatch | ViewBatch) -> Float[Tensor, ""]:
         """Return the error; colours are in [0, 1]."""
+        if output.rendered is None:
+            raise ConfigError("the pixel loss needs rendered rays, and this system renders none in training.")
         loss = (output.rendered.rgbs - batch.rgbs).square().mean()
         if output.rendered.coarse_rgbs is not None:
             # Paper: does not mention the coarse tier's loss; jaxnerf, on which it builds, adds it with weight 1.

@@ -7,6 +7,8 @@ from vpd_lightning.errors import CheckpointError
 from vpd_lightning.training.checkpoint_io import LAST, PREVIOUS, load_checkpoint
 
 FOLDER = "checkpoints"
+FIRST_TRAINING = "pretraining"
+"""Where the first of two trainings lies in the run folder; ``config.pretraining`` says the same, below this layer."""
 
 log = logging.getLogger(__name__)
 
@@ -42,15 +44,22 @@ def find_resume(folder: str | Path) -> Path:
 
 
 def latest_run(experiment_folder: str | Path) -> Path:
-    """Return the run below a folder whose ``last.ckpt`` was written last; CheckpointError where there is none."""
+    """Return the run below a folder that saved a ``last.ckpt`` last, be it in the first of two trainings.
+
+    Raises:
+        CheckpointError: there is none.
+    """
     experiment_folder = Path(experiment_folder)
-    found = [
-        (path.stat().st_mtime, path.parent.parent)
-        for name in (LAST, PREVIOUS)
-        for path in experiment_folder.glob(f"*/{FOLDER}/{name}")
-    ]
+    found = [(saved, run) for run in experiment_folder.glob("*") if (saved := last_saved(run)) is not None]
     if not found:
         raise CheckpointError(
             f"No run below {experiment_folder} has saved a checkpoint yet.\nTrain without resume=last."
         )
     return max(found)[1]
+
+
+def last_saved(run: Path) -> float | None:
+    """Return when a run, or the first of its two trainings, last saved a checkpoint to go on from; None: never."""
+    places = [run / FOLDER, run / FIRST_TRAINING / FOLDER]
+    files = [place / name for place in places for name in (LAST, PREVIOUS)]
+    return max((path.stat().st_mtime for path in files if path.is_file()), default=None)

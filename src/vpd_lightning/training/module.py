@@ -1,7 +1,7 @@
 """The training of a simulator as a LightningModule: which parts are called when, and what is logged. No maths."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import lightning.pytorch as pl
@@ -12,26 +12,27 @@ from vpd_lightning.data.validation import VideoClip
 from vpd_lightning.errors import ConfigError, NonFiniteError
 from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.metrics.psnr import mean_squared_error, psnr, psnr_of
+from vpd_lightning.system import AbstractSystem
 from vpd_lightning.training.optimization import AbstractOptimization
-from vpd_lightning.types import VideoBatch
+from vpd_lightning.types import VideoBatch, ViewBatch
 
 BEST_METRIC = "validation/psnr"
 
 
 class VPDModule(pl.LightningModule):
-    """Trains ``simulator`` on the weighted sum of ``losses``.
+    """Trains ``simulator`` (any system) on the weighted sum of ``losses``.
 
     ``config`` is the resolved configuration as plain containers; it is stored in every checkpoint, as its
     ``hyper_parameters``, and is what a model is rebuilt from.
 
     After each step, ``train_metrics`` holds what is to be logged: loss, loss/<name>, psnr (training rays), lr,
-    gradient_norm, rays_per_second, uncovered_share (where the dynamics measures it).
+    gradient_norm, rays_per_second, uncovered_share (where the dynamics measures it), and what a loss measures beside.
     """
 
     def __init__(
         self,
         *,
-        simulator: nn.Module,
+        simulator: AbstractSystem,
         losses: Sequence[AbstractLoss],
         optimization: AbstractOptimization,
         config: Mapping[str, Any],
@@ -48,18 +49,24 @@ class VPDModule(pl.LightningModule):
         self.losses = nn.ModuleList(losses)
         self.optimization = optimization
         self.train_metrics: dict[str, Tensor | float] = {}
+        self.expected_steps: Callable[[], int] | None = None
         self._clips: Sequence[str] = ()
         self.seconds_per_step: float | None = None
         self._last_start: float | None = None
 
     def configure_optimizers(self) -> dict[str, Any]:
-        """Build the optimiser for ``trainer.max_steps`` updates; its schedule moves with every update."""
-        optimizer, schedule = self.optimization.build(self.simulator, self.trainer.max_steps)
+        """Build the optimiser; its schedule moves with every update and ends at ``trainer.max_steps``.
+
+        Where a time budget ends the training (``callbacks.time_budget``), ``expected_steps`` says how many updates that
+        will be, as far as is known.
+        """
+        expected = self.expected_steps or (lambda: self.trainer.max_steps)
+        optimizer, schedule = self.optimization.build(self.simulator, expected)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     # -- training ------------------------------------------------------------------------------------------------------
 
-    def training_step(self, batch: VideoBatch, batch_idx: int) -> Tensor:
+    def training_step(self, batch: VideoBatch | ViewBatch, batch_idx: int) -> Tensor:
         """Return the weighted sum of all losses; NonFiniteError before anything is updated by a bad one."""
         self._clips = batch.clips
         self._time_step()
@@ -73,12 +80,15 @@ class VPDModule(pl.LightningModule):
         self.train_metrics = {
             "loss": total.detach(),
             **{f"loss/{name}": part.detach() for name, part in parts.items()},
-            "psnr": psnr_of(mean_squared_error(output.rendered.rgbs.detach().float(), batch.rgbs.float())).mean(),
+            **{name: value for loss in self.losses for name, value in loss.measured.items()},  # type: ignore[operator,union-attr]
         }
+        if output.rendered is not None:
+            error = mean_squared_error(output.rendered.rgbs.detach().float(), batch.rgbs.float())
+            self.train_metrics["psnr"] = psnr_of(error).mean()
         if self.seconds_per_step is not None:
             rays = batch.rgbs.shape[:-1].numel() * self.trainer.world_size
             self.train_metrics["rays_per_second"] = rays / self.seconds_per_step
-        uncovered = getattr(self.simulator.dynamics, "last_uncovered_share", None)
+        uncovered = getattr(getattr(self.simulator, "dynamics", None), "last_uncovered_share", None)
         if uncovered is not None:
             self.train_metrics["uncovered_share"] = uncovered
         return total
@@ -127,14 +137,8 @@ class VPDModule(pl.LightningModule):
     def validation_step(self, clip: VideoClip, batch_idx: int) -> dict[str, Any]:
         """Roll one clip out and compare all its frames; returns the pictures for callbacks to draw."""
         clip = clip.to(self._parameter_dtype())
-        context, target = clip.context, clip.target
-        scene = self.simulator.encode(context.rgb, context.depth, context.cameras)  # type: ignore[operator]
-        states = self.simulator.rollout(scene, target.rgb.shape[0])  # type: ignore[operator]
-        frames = [
-            self.simulator.render([state], target.cameras[step])  # type: ignore[operator]
-            for step, state in enumerate(states)
-        ]
-        prediction = torch.cat(frames).float()
+        target = clip.target
+        prediction = self.simulator.predict_frames(clip.context, target.cameras).float()
         values = psnr(prediction, target.rgb.float() / 255.0)
         if not torch.isfinite(prediction).all():
             raise NonFiniteError(

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -29,8 +29,11 @@ class AbstractOptimization(ABC):
     def share_at(self, step: int, max_steps: int) -> float:
         """Return the factor on all learning rates for the update that follows ``step`` updates."""
 
-    def build(self, simulator: nn.Module, max_steps: int) -> tuple[torch.optim.Adam, LambdaLR]:
+    def build(self, simulator: nn.Module, max_steps: int | Callable[[], int]) -> tuple[torch.optim.Adam, LambdaLR]:
         """Return the optimiser and its schedule, to be stepped after every update.
+
+        ``max_steps`` is asked again for every update where it is a function: a training that ends after a given time
+        learns how many updates that allows.
 
         Stages are the direct children of the simulator; a stage without a multiplier has 1. Raises ValueError where a
         multiplier names no stage.
@@ -44,12 +47,13 @@ class AbstractOptimization(ABC):
         for name, stage in [*stages.items(), ("simulator", simulator)]:
             parameters = [p for p in stage.parameters() if p.requires_grad and id(p) not in seen]
             seen.update(map(id, parameters))
-            if parameters:
+            if parameters:  # a frozen stage has none
                 rate = self.lr * self.stage_multipliers.get(name, 1.0)
                 groups.append({"params": parameters, "lr": rate, "name": name})
         optimizer = torch.optim.Adam(groups, betas=self.betas, eps=self.eps)
         # A plain function: a scheduler writes the attributes of other callables into the checkpoint.
-        return optimizer, LambdaLR(optimizer, lambda step: self.share_at(step, max_steps))
+        expected = max_steps if callable(max_steps) else lambda: max_steps
+        return optimizer, LambdaLR(optimizer, lambda step: self.share_at(step, expected()))
 
 
 class StepDecayAdam(AbstractOptimization):

@@ -3,12 +3,14 @@
 import io
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import tiny_data, tiny_module, tiny_trainer
 from vpd_lightning.training.callbacks.progress import Progress, clock
+from vpd_lightning.training.callbacks.time_budget import TimeBudget
 
 
 class Terminal(io.StringIO):
@@ -42,6 +44,37 @@ def test_a_live_line_on_a_terminal(data: Path, tmp_path: Path, monkeypatch: pyte
     monkeypatch.setenv("COLUMNS", "120")
     text = train(data, tmp_path, Terminal())
     assert "\x1b[" in text and "12/12" in text and "rays/s" in text and "validation after step 10" in text
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_end_of_a_time_budget_is_told_and_is_the_end_of_the_bar(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_terminal: bool
+) -> None:
+    class TwelveSteps(TimeBudget):
+        def now(self) -> float:
+            return self.time
+
+        def on_train_batch_start(self, *args: Any) -> None:
+            super().on_train_batch_start(*args)
+            self.time += 5.0
+
+        time = 0.0
+
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "160")
+    stream = Terminal() if is_terminal else io.StringIO()
+    progress = Progress(every_n_steps=50, stream=stream)
+    totals = []
+    monkeypatch.setattr(
+        progress, "teardown", lambda *_, **__: totals.append(progress._bar and progress._bar.tasks[0].total)
+    )
+    trainer = tiny_trainer(tmp_path, 1000, [TwelveSteps(minutes=1.0, clock="cpu"), progress])
+    trainer.fit(tiny_module(), tiny_data(data, num_steps_schedule=None))
+    assert trainer.global_step == 12
+    assert "the time is up: step 12/about 12  " in stream.getvalue()
+    if is_terminal:
+        assert totals == [12]
+        progress._bar.stop()
 
 
 def test_clock() -> None:

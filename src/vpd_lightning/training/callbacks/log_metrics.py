@@ -6,7 +6,7 @@ import lightning.pytorch as pl
 
 from vpd_lightning.training.metrics_csv import MetricsCSV
 from vpd_lightning.training.module import VPDModule
-from vpd_lightning.types import VideoBatch
+from vpd_lightning.types import VideoBatch, ViewBatch
 
 
 class LogMetrics(pl.Callback):
@@ -23,7 +23,12 @@ class LogMetrics(pl.Callback):
                 logger.rewind(trainer.global_step)
 
     def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: VideoBatch, batch_idx: int
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: VideoBatch | ViewBatch,
+        batch_idx: int,
     ) -> None:
         """Log a training step."""
         assert isinstance(pl_module, VPDModule)

@@ -7,7 +7,7 @@ from typing import Any
 import lightning.pytorch as pl
 
 from vpd_lightning.training.module import BEST_METRIC, VPDModule
-from vpd_lightning.types import VideoBatch
+from vpd_lightning.types import VideoBatch, ViewBatch
 
 
 class Progress(pl.Callback):
@@ -46,7 +46,12 @@ class Progress(pl.Callback):
         self._task = self._bar.add_task("training", total=trainer.max_steps, completed=trainer.global_step, line="")
 
     def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: VideoBatch, batch_idx: int
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: VideoBatch | ViewBatch,
+        batch_idx: int,
     ) -> None:
         """Show the step where it is time to."""
         assert isinstance(pl_module, VPDModule)
@@ -57,9 +62,15 @@ class Progress(pl.Callback):
             # Values are fetched from the device at a readable pace only; each fetch waits for it.
             is_shown = step % min(10, self.every_n_steps) == 0 or step == trainer.max_steps
             fields = {"line": self._line(trainer, pl_module)} if is_shown else {}
-            self._bar.update(self._task, completed=step, **fields)
+            self._bar.update(self._task, completed=step, total=_total(trainer, pl_module), **fields)
         elif step % self.every_n_steps == 0 or step == trainer.max_steps:
             self._print(self._line(trainer, pl_module))
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Say where a time budget ended the training."""
+        assert isinstance(pl_module, VPDModule)
+        if self._is_active and pl_module.expected_steps is not None and trainer.global_step < trainer.max_steps:
+            self._print(f"the time is up: {self._line(trainer, pl_module)}")
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Show the validation's PSNR."""
@@ -69,13 +80,16 @@ class Progress(pl.Callback):
 
     def _line(self, trainer: pl.Trainer, module: VPDModule) -> str:
         step, metrics = trainer.global_step, module.train_metrics
-        parts = [f"step {step}/{trainer.max_steps}"]
+        # Where a time budget ends the training, the number of steps is an estimate.
+        is_estimate = module.expected_steps is not None
+        total = _total(trainer, module)
+        parts = [f"step {step}/{'about ' if is_estimate else ''}{total}"]
         seconds = module.seconds_per_step
         if seconds is not None:
             parts += [f"{1.0 / seconds:.2f} it/s"]
             if "rays_per_second" in metrics:
                 parts += [f"{float(metrics['rays_per_second']):,.0f} rays/s"]
-            parts += [f"ETA {clock(seconds * (trainer.max_steps - step))}"]
+            parts += [f"ETA {clock(seconds * (total - step))}"]
         parts += [f"{name} {float(metrics['loss']):.5f}" for name in ("loss",) if name in metrics]
         parts += [f"PSNR {float(metrics['psnr']):.2f}" for name in ("psnr",) if name in metrics]
         return "  ".join(parts)
@@ -91,6 +105,10 @@ class Progress(pl.Callback):
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+
+def _total(trainer: pl.Trainer, module: VPDModule) -> int:
+    return module.expected_steps() if module.expected_steps is not None else trainer.max_steps
 
 
 def clock(seconds: float) -> str:
