@@ -1,7 +1,9 @@
 """Ground-truth state of a trajectory: for evaluation and plots only; the training path never imports this module."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -18,7 +20,8 @@ class GroundTruth:
     """What the simulator knew. World frame, metres, seconds, radians; quaternions w x y z, body to world.
 
     ``segmentation`` is 0 for floor and background and ``i + 1`` for object ``i``. ``half_sizes`` are along the body's
-    own axes.
+    own axes. Soft bodies have vertices as well (all bodies one after another), the object that each belongs to, and the
+    tetrahedra between them; their poses are those of the rigid motion that fits best, their half sizes those at rest.
     """
 
     positions: NDArray[np.float64]  # (time, object, 3)
@@ -27,6 +30,9 @@ class GroundTruth:
     angular_velocities: NDArray[np.float64]  # (time, object, 3)
     half_sizes: NDArray[np.float64]  # (object, 3)
     segmentation: NDArray[np.uint8]  # (time, view, height, width)
+    vertices: NDArray[np.float32] | None = None  # (time, vertex, 3)
+    vertex_objects: NDArray[np.int32] | None = None  # (vertex,)
+    tetrahedra: NDArray[np.int32] | None = None  # (element, 4), indices into vertices
 
     @property
     def num_objects(self) -> int:
@@ -41,12 +47,28 @@ _LAYOUT = {
     schema.STATE_HALF_SIZES: (np.float64, 2),
     schema.STATE_SEGMENTATION: (np.uint8, 4),
 }  # name: dtype, number of axes
+_SOFT_LAYOUT = {
+    schema.STATE_VERTICES: (np.float32, 3),
+    schema.STATE_VERTEX_OBJECTS: (np.int32, 1),
+    schema.STATE_TETRAHEDRA: (np.int32, 2),
+}
 
 
 def has_state(path: str | Path) -> bool:
     """Tell whether a trajectory carries the whole ground truth."""
     with open_file(Path(path)) as file:
         return schema.STATE in file and all(name in file[schema.STATE] for name in _LAYOUT)
+
+
+def read_positions(path: str | Path) -> NDArray[np.float64] | None:
+    """Read the positions (time, object, 3) alone; None where the trajectory does not carry the whole ground truth."""
+    path = Path(path)
+    with open_file(path) as file:
+        if schema.STATE not in file or any(name not in file[schema.STATE] for name in _LAYOUT):
+            return None
+        return _read(path, file[schema.STATE], {schema.STATE_POSITIONS: _LAYOUT[schema.STATE_POSITIONS]})[
+            schema.STATE_POSITIONS
+        ]
 
 
 def read_state(path: str | Path) -> GroundTruth:
@@ -59,9 +81,41 @@ def read_state(path: str | Path) -> GroundTruth:
                 f"{path} has no complete ground truth ({schema.STATE}/ needs {', '.join(_LAYOUT)}).\n"
                 "What needs it cannot be evaluated on such recordings; the pixels can still be compared."
             )
-        check_links(path, group)
-        arrays = {
-            name: read_whole(path, checked_dataset(path, group, name, dtypes=[dtype], num_axes=[num_axes]))
-            for name, (dtype, num_axes) in _LAYOUT.items()
-        }
-    return GroundTruth(**arrays)
+        soft = [name for name in _SOFT_LAYOUT if name in group]
+        if soft and len(soft) < len(_SOFT_LAYOUT):
+            raise DataError(
+                f"{path} has only a part of the ground truth of soft bodies ({', '.join(soft)}).\n"
+                f"{schema.STATE}/ needs {', '.join(_SOFT_LAYOUT)}, or none of them where bodies are rigid."
+            )
+        arrays = _read(path, group, {**_LAYOUT, **(_SOFT_LAYOUT if soft else {})})
+    state = GroundTruth(**arrays)
+    _check_meshes(path, state)
+    return state
+
+
+def _read(path: Path, group: h5py.Group, layout: Mapping[str, tuple[Any, int]]) -> dict[str, NDArray[Any]]:
+    check_links(path, group)
+    return {
+        name: read_whole(path, checked_dataset(path, group, name, dtypes=[dtype], num_axes=[num_axes]))
+        for name, (dtype, num_axes) in layout.items()
+    }
+
+
+def _check_meshes(path: Path, state: GroundTruth) -> None:
+    """Refuse vertices that do not fit the poses, and indices that point at nothing."""
+    if state.vertices is None or state.vertex_objects is None or state.tetrahedra is None:
+        return
+    num_times, num_vertices = state.vertices.shape[:2]
+    sound = (
+        num_times == state.positions.shape[0]
+        and state.vertices.shape[2] == 3
+        and state.vertex_objects.shape == (num_vertices,)
+        and state.tetrahedra.shape[1] == 4
+        and 0 <= state.vertex_objects.min() <= state.vertex_objects.max() < state.num_objects
+        and 0 <= state.tetrahedra.min() <= state.tetrahedra.max() < num_vertices
+    )
+    if not sound:
+        raise DataError(
+            f"{path}: {', '.join(_SOFT_LAYOUT)} in {schema.STATE}/ do not fit each other or the poses.\n"
+            "Allowed: (time, vertex, 3); (vertex,), numbers of objects; (element, 4), numbers of vertices."
+        )
