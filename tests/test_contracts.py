@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from vpd_lightning.config import build, build_list, compose, config_folder, load_plugins
+from vpd_lightning.config import build, compose, config_folder, load_plugins
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.persistence import PersistenceDynamics
 from vpd_lightning.encoder.base import AbstractEncoder
@@ -34,10 +34,14 @@ from vpd_lightning.testing import (
     LossContract,
     RendererContract,
 )
+from vpd_lightning.types import SimulatorOutput, VideoBatch
 
 # Any option may hold any of these; where it does, the test takes the small value. All else stays as the file says.
 SMALL = {
     "channels": [6, 8, 6, 8, FEATURE_DIM],
+    "widths": [4, 4, 8, 8],
+    "blocks": [1, 1, 1, 1],
+    "num_groups": 2,
     "num_particles": 30,
     "num_views": NUM_VIEWS,
     "height": IMAGE_SIZE,
@@ -53,6 +57,7 @@ SMALL = {
     "num_fine_samples": 12,
     "background_width": 8,
     "ray_chunk_size": 10,  # fewer than the rays of a check, so that chunks are joined
+    "initial_depth": 1.4,  # from the cameras of the checks to the middle of the scene
 }
 SCENE = [
     "scene=demo",
@@ -69,6 +74,18 @@ SCENE = [
 
 # What a class cannot satisfy, by its name, so that a new option of the same class needs no entry.
 DEPARTURES = {
+    "DepthPredictingEncoder": {
+        "test_particles_lie_on_what_was_measured": "particles lie where the predicted depth says",
+        "test_without_a_measured_pixel_there_is_nothing": "the measured depth is not looked at",
+    },
+    "GlobalSceneEncoder": {  # its one particle lies at the origin, which is on the floor of the scene of the checks
+        "test_without_a_measured_pixel_there_is_nothing": "depth is not looked at",
+    },
+    "GlobalNeRFRenderer": {
+        "test_moving_the_world_and_the_camera_leaves_the_picture_alone": "its network sees absolute places",
+        "test_the_picture_shows_the_particles": "the scene is in the features; positions are not looked at",
+        "test_the_positions_get_a_finite_gradient": "positions are not looked at",
+    },
     "HierarchicalGNNDynamics": {
         "test_order_of_particles_does_not_matter": "abstract nodes are drawn among the slots of the current particles"
     },
@@ -147,14 +164,25 @@ class TestRenderers(ChosenOption, RendererContract):
 class TestLosses(ChosenOption, LossContract):
     group, base = "loss", AbstractLoss
 
-    @pytest.fixture(params=options("loss"), autouse=True)
+    # An option may hold several losses.
+    @pytest.fixture(
+        params=[f"{name}.{entry}" for name in options("loss") for entry in composed("loss", name)], autouse=True
+    )
     def _option(self, request: pytest.FixtureRequest) -> None:
-        self.choose(request.param)
+        option, _, entry = request.param.partition(".")
+        self.choose(option)
+        self.section = self.section[entry]
 
-    def build(self) -> Any:
-        losses = build_list(self.section, AbstractLoss, "loss")
-        assert len(losses) == 1, "one contract test holds one loss; test the others through options of their own"
-        return losses[0]
+    def output(self, batch: VideoBatch) -> SimulatorOutput:
+        """Return an output that also has what a loss may ask a stage for."""
+        made = super().output(batch)
+        draw = {"generator": torch.Generator().manual_seed(7), "dtype": torch.float64}
+        shape = made.states[0].positions.shape[:1] + (len(made.states),)
+        names = ("predicted_features", "target_features", "predicted_slots", "target_slots")
+        auxiliary = {name: torch.rand(*shape, 5, 4, **draw) for name in names}
+        auxiliary["point_mass"] = torch.rand(*shape, 5, **draw)
+        auxiliary["predicted_depth"] = 1 + torch.rand(batch.context.depth[:, 1].shape, **draw)
+        return replace(made, auxiliary={name: value.to(batch.rgbs) for name, value in auxiliary.items()})
 
 
 # The contracts themselves: each fault must be found by the check that is named beside it.

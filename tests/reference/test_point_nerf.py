@@ -24,6 +24,7 @@ def _renderer() -> PointNeRFRenderer:
         feature_dim=FEATURE_DIM, num_neighbors=NUM_NEIGHBORS, kernel_radii=RADII, kernel_bandwidths=BANDWIDTHS,
         near=NEAR, far=FAR, num_coarse_samples=NUM_COARSE, num_fine_samples=NUM_FINE, net_depth=6, net_width=8,
         skip_layer=4, net_width_condition=5, view_degree=VIEW_DEGREE, density_activation="relu",
+        kernel_normalization=None, normalization_epsilon=1e-6, feature_network=None,
         neighbors_backend="auto", features_backend="auto", sort_particles=True, reuse_coarse=True, max_radius=None,
         early_stop=0.0, num_stop_segments=4, share_rows_below=None, ray_chunk_size=3, checkpoint_chunks=True,
     )  # fmt: skip

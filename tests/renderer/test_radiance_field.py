@@ -38,7 +38,9 @@ def literal(field: RadianceField, features: torch.Tensor, directions: torch.Tens
     if directions is not None:
         encoded = positional_encoding(directions, 2)[..., None, :].expand(*hidden.shape[:-1], -1)
         hidden = torch.cat([field.bottleneck(hidden), encoded], dim=-1)
-    return density, field.color(field.condition(hidden).relu()).sigmoid()
+    if field.condition is not None:
+        hidden = field.condition(hidden).relu()
+    return density, field.color(hidden).sigmoid()
 
 
 @pytest.mark.parametrize("density_activation", ["relu", "softplus"])
@@ -53,6 +55,24 @@ def test_the_fused_network_equals_jaxnerfs(view_degree: int | None, density_acti
         torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-12)
     gradients = [
         torch.autograd.grad(sigmas.sum() + rgbs.square().sum(), [features, *field.parameters()])
+        for sigmas, rgbs in (got, expected)
+    ]
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("condition", [{"view_degree": 2}, {"view_degree": None, "net_width_condition": None}])
+def test_scenes_given_once_equal_scenes_concatenated_at_every_sample(condition: dict[str, int | None]) -> None:
+    field = field_of(**condition)
+    features = torch.rand(2, 3, 5, 4, dtype=torch.float64, requires_grad=True)
+    scenes = torch.rand(2, 2, dtype=torch.float64, requires_grad=True)
+    directions = None if condition["view_degree"] is None else torch.randn(2, 3, 3, dtype=torch.float64)
+    whole = torch.cat([features, scenes[:, None, None].expand(2, 3, 5, 2)], dim=-1)
+    got, expected = field(features, directions, scenes=scenes), literal(field, whole, directions)
+    for one, other in zip(got, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-12)
+    gradients = [
+        torch.autograd.grad(sigmas.sum() + rgbs.square().sum(), [features, scenes, *field.parameters()])
         for sigmas, rgbs in (got, expected)
     ]
     for one, other in zip(*gradients, strict=True):
@@ -77,9 +97,12 @@ def test_the_encoding_has_jaxnerfs_order_and_length() -> None:
     assert torch.equal(positional_encoding(vectors, 0), vectors)
 
 
-@pytest.mark.parametrize(("view_degree", "count"), [(None, 527_108), (4, 596_356)])
-def test_parameter_counts_at_the_papers_size(view_degree: int | None, count: int) -> None:
-    size = {"input_dim": 64, "net_depth": 8, "net_width": 256, "skip_layer": 4, "net_width_condition": 128}
+# Without view directions and without a layer of its own, the colour is 3 * 257 numbers instead of 128 * 257 + 3 * 129.
+@pytest.mark.parametrize(
+    ("view_degree", "layer", "count"), [(None, 128, 527_108), (4, 128, 596_356), (None, None, 494_596)]
+)
+def test_parameter_counts_at_the_papers_size(view_degree: int | None, layer: int | None, count: int) -> None:
+    size = {"input_dim": 64, "net_depth": 8, "net_width": 256, "skip_layer": 4, "net_width_condition": layer}
     field = RadianceField(**(SMALL | size | {"view_degree": view_degree}))
     assert sum(parameter.numel() for parameter in field.parameters()) == count
 
@@ -128,7 +151,13 @@ def test_autocast_rounds_the_fused_network_no_worse_than_jaxnerfs(view_degree: i
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("net_depth", 0), ("view_degree", -1), ("density_activation", "exp"), ("initial_density", 0.0)],
+    [
+        ("net_depth", 0),
+        ("view_degree", -1),
+        ("density_activation", "exp"),
+        ("initial_density", 0.0),
+        ("net_width_condition", None),
+    ],
 )
 def test_values_out_of_range_are_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=name):

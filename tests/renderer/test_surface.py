@@ -30,6 +30,9 @@ SMALL = {
     "net_width_condition": 8,
     "view_degree": 2,
     "density_activation": "softplus",
+    "kernel_normalization": None,
+    "normalization_epsilon": 1e-6,
+    "feature_network": None,
     "background_width": 8,
     "ray_chunk_size": 1000,
     "checkpoint_chunks": False,
@@ -117,7 +120,8 @@ def test_compiled_features_and_gradients_equal_the_plain_ones(count: int, num_ne
     for dtype, backend in ((torch.float64, "torch"), (torch.float32, "numba")):
         inputs = [value.to(dtype).requires_grad_() for value in values]
         radii, bandwidths = (0.0, 0.05, 0.3), (0.05, 0.02, 0.4)  # exp(-(0.5 / 0.02)^2) is below float32's range
-        features = ray_features(RayCandidates(*inputs, mask), t.to(dtype), num_neighbors, radii, bandwidths, backend)
+        candidates = RayCandidates(*inputs, mask, torch.zeros(2, 9, count, 3, dtype=dtype))
+        features = ray_features(candidates, t.to(dtype), num_neighbors, radii, bandwidths, backend)
         assert features.dtype == dtype
         weights = torch.linspace(-1, 1, features.numel(), dtype=dtype).view(features.shape)
         results.append(

@@ -109,6 +109,8 @@ def test_float32_pictures_are_those_of_float64(option: str, name: str, device: t
     # A sample's place is known to eps of its coordinates (1e3 m: 6e-5 m, 1/800 of a bandwidth), and the features change
     # by about that share; the networks here have gains of about one.
     tolerance = 1e-4 if name != "translated_1000" else 2e-2
+    if "global_nerf" in option:  # its ten octaves of the place multiply that error by up to 2^9
+        tolerance = max(tolerance, 5e-3)
     torch.testing.assert_close(single.rgbs.double(), twin.rgbs, rtol=0, atol=tolerance)
     torch.testing.assert_close(single.opacities.double(), twin.opacities, rtol=0, atol=tolerance)
 
@@ -136,6 +138,8 @@ def test_all_empty_and_all_opaque_rays(option: str, density: float, mode: Mode, 
 
 @pytest.mark.parametrize("shift", [1e3, 1e6])
 def test_a_translated_world_has_the_same_picture(option: str, shift: float, device: torch.device):
+    if "global_nerf" in option:
+        pytest.skip("it knows absolute places by design, and no particles")
     offset = shift * torch.tensor([1.0, -0.7, 0.4], dtype=torch.float64)
     renderer = stage("renderer", option, FLOAT64, device).eval()
     particles = particles_at(cloud(), FLOAT64, device)
@@ -177,8 +181,8 @@ def test_padding_does_not_matter_far_from_the_origin(
 
 
 def test_a_rotated_world_has_the_same_densities(option: str, device: torch.device):
-    if "splat" in option:
-        pytest.skip("its network sees offsets and view directions in world axes by design")
+    if any(name in option for name in ("splat", "feature_network", "global_nerf")):
+        pytest.skip("its network sees places, offsets or view directions in world axes by design")
     turn = rotation().to(device)
     renderer = stage("renderer", option, FLOAT64, device).eval()
     particles = particles_at(cloud(), FLOAT64, device)

@@ -131,6 +131,9 @@ def field_lipschitz(field: RadianceField) -> Lipschitz:
     sides of a difference. A channel of colour has a quarter of the norm of its row.
 
     True for every input, hence far above what a particular one shows.
+
+    Raises:
+        ValueError: a colour branch without a layer of its own.
     """
     bound = 0.0
     for index, (layer, takes_input) in enumerate(zip(field.trunk, field.takes_input, strict=True)):
@@ -143,6 +146,8 @@ def field_lipschitz(field: RadianceField) -> Lipschitz:
             bound = min(parts, _spectral_norm(weight) * math.hypot(bound, 1.0))
         else:
             bound *= _spectral_norm(weight)
+    if field.condition is None:
+        raise ValueError("This bound needs a colour branch with its own layer; net_width_condition is None.")
     condition = field.condition.weight.double()
     if field.bottleneck is not None:
         condition = condition[:, : field.bottleneck.out_features] @ field.bottleneck.weight.double()

@@ -7,19 +7,28 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from vpd_lightning.geometry.ray_sampling import even_quantiles, sample_pdf, stratified_samples
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.chunked_rays import automatic_chunk_size, joined, ray_slices, recomputed, uniform_draws
 from vpd_lightning.renderer.early_stop import front_to_back
+from vpd_lightning.renderer.feature_network import FeatureNetwork
 from vpd_lightning.renderer.fused_features import FEATURE_BACKENDS
 from vpd_lightning.renderer.merged_samples import MergedSamples
+from vpd_lightning.renderer.neighbor_features import NeighborFeatures
 from vpd_lightning.renderer.point_features import check_kernels
-from vpd_lightning.renderer.precision import at_least_float32, full_precision
+from vpd_lightning.renderer.precision import at_least_float32
 from vpd_lightning.renderer.radiance_field import RadianceField
 from vpd_lightning.renderer.row_sharing import SharedRows
 from vpd_lightning.renderer.sample_features import SampleFeatures
+from vpd_lightning.renderer.two_tiers import (
+    closed_color,
+    coarse_samples,
+    composited_rays,
+    fine_samples,
+    interval_ends,
+    points_along,
+)
 from vpd_lightning.renderer.volumetric import ray_weights
 from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
@@ -39,6 +48,9 @@ class PointNeRFRenderer(AbstractRenderer):
     over the batch axis. With ``checkpoint_chunks``
     activations are computed again in the backward pass, with exact gradients: the neighbour tables, the random draws
     and the features of each sample (64 numbers) are kept, the networks' activations are not.
+
+    ``kernel_normalization``, ``normalization_epsilon`` and ``feature_network`` make the features others than the
+    paper's main model has them, see ``NeighborFeatures``. ``bounds`` does not speak of those.
 
     Exact, up to the order of summation: ``sort_particles`` (along a Morton curve, for the cache; equally distant
     particles may change places), ``reuse_coarse`` (the fine tier does not compute the coarse samples' neighbours and
@@ -69,6 +81,9 @@ class PointNeRFRenderer(AbstractRenderer):
         net_width_condition: int,
         view_degree: int,
         density_activation: str,
+        kernel_normalization: str | None,
+        normalization_epsilon: float,
+        feature_network: FeatureNetwork | None,
         neighbors_backend: str,
         features_backend: str,
         sort_particles: bool,
@@ -102,6 +117,19 @@ class PointNeRFRenderer(AbstractRenderer):
             raise ValueError(f"neighbors_backend must be auto or one of {BACKENDS}, got {neighbors_backend!r}.")
         if features_backend not in ("auto", *FEATURE_BACKENDS):
             raise ValueError(f"features_backend must be auto or one of {FEATURE_BACKENDS}, got {features_backend!r}.")
+        self.variant = NeighborFeatures(
+            feature_dim=feature_dim,
+            kernel_radii=kernel_radii,
+            kernel_bandwidths=kernel_bandwidths,
+            kernel_normalization=kernel_normalization,
+            normalization_epsilon=normalization_epsilon,
+            feature_network=feature_network,
+        )
+        if not self.variant.is_plain and features_backend not in ("auto", "torch"):
+            raise ValueError(
+                f"features_backend must be auto or torch with kernel_normalization or feature_network: "
+                f"{features_backend} knows the plain features only."
+            )
         self.num_neighbors = num_neighbors
         self.kernel_radii = tuple(float(radius) for radius in kernel_radii)
         self.kernel_bandwidths = tuple(float(bandwidth) for bandwidth in kernel_bandwidths)
@@ -180,6 +208,12 @@ class PointNeRFRenderer(AbstractRenderer):
         origins, directions = at_least_float32(rays.origins), at_least_float32(rays.directions)
         return self._composited(*self._fine_tier(features, origins, directions, t), t)
 
+    def point_features(
+        self, particles: Particles, queries: Float[Tensor, "batch query 3"]
+    ) -> Float[Tensor, "batch query feature"]:
+        """Return what the radiance fields are given at points of the scene (metres)."""
+        return self._sample_features(particles.without_padding())(queries[:, :, None])[:, :, 0]
+
     def _render(
         self,
         features: SampleFeatures,
@@ -189,14 +223,14 @@ class PointNeRFRenderer(AbstractRenderer):
     ) -> RenderedRays:
         origins, directions = at_least_float32(rays.origins), at_least_float32(rays.directions)
         # Coarse: where is light stopped?
-        t_coarse = self._coarse_samples(origins, noise)
-        coarse_features = features(_points(origins, directions, t_coarse))
+        t_coarse = coarse_samples(origins, self.near, self.far, self.num_coarse_samples, noise)
+        coarse_features = features(points_along(origins, directions, t_coarse))
         needs_color = self.training or torch.is_grad_enabled()
         sigmas, rgbs = self._evaluate(self.coarse, coarse_features, directions=None, use_color=needs_color)
-        coarse_weights, transmittance = ray_weights(sigmas, t_coarse, self._ends(t_coarse))
-        coarse_rgbs = None if rgbs is None else _closed(coarse_weights, transmittance, rgbs)
+        coarse_weights, transmittance = ray_weights(sigmas, t_coarse, interval_ends(t_coarse, self.far))
+        coarse_rgbs = None if rgbs is None else closed_color(coarse_weights, transmittance, rgbs)
         # Fine: the same samples, and more of them there.
-        t_fine = self._fine_samples(t_coarse, coarse_weights.detach(), quantiles)
+        t_fine = fine_samples(t_coarse, coarse_weights.detach(), self.num_fine_samples, quantiles)
         t, order = torch.cat([t_coarse, t_fine], dim=-1).sort(dim=-1)
         if self.reuse_coarse:
             outputs = self._fine_tier(features, origins, directions, t, t_fine, order, coarse_features)
@@ -216,19 +250,19 @@ class PointNeRFRenderer(AbstractRenderer):
     ) -> tuple[Float[Tensor, "batch ray sample"], Float[Tensor, "batch ray sample 3"]]:
         """Return densities and colours at ``t``: of ``known`` features and new places, in the ``order`` of distance."""
         if self.early_stop > 0:
-            samples = MergedSamples(features, _points(origins, directions, t), order, known)
+            samples = MergedSamples(features, points_along(origins, directions, t), order, known)
             flat_directions = directions.flatten(0, 1)
             sigmas, rgbs = front_to_back(
                 lambda rays, part: self._evaluate(self.fine, samples.features(rays, part), flat_directions[rays]),
                 t.flatten(0, 1),
-                self._ends(t).flatten(0, 1),
+                interval_ends(t, self.far).flatten(0, 1),
                 self.early_stop,
                 self.num_stop_segments,
             )
             return sigmas.view(t.shape), rgbs.view(*t.shape, 3)
         if known is None or t_new is None or order is None:
-            return self._evaluate(self.fine, features(_points(origins, directions, t)), directions)
-        new = features(_points(origins, directions, t_new))
+            return self._evaluate(self.fine, features(points_along(origins, directions, t)), directions)
+        new = features(points_along(origins, directions, t_new))
         sigmas, rgbs = self._evaluate(self.fine, (known, new), directions)
         # The network does not care about order, so only its four outputs are sorted, not the features.
         return sigmas.gather(-1, order), rgbs.gather(-2, order[..., None].expand(*order.shape, 3))
@@ -245,33 +279,7 @@ class PointNeRFRenderer(AbstractRenderer):
         t: Float[Tensor, "batch ray sample"],
         coarse_rgbs: Float[Tensor, "batch ray 3"] | None = None,
     ) -> RenderedRays:
-        weights, transmittance = ray_weights(sigmas, t, self._ends(t))
-        with full_precision(t):
-            depths = (weights * t).sum(dim=-1) + transmittance * t[..., -1]
-        return RenderedRays(_closed(weights, transmittance, rgbs), depths, 1.0 - transmittance, coarse_rgbs)
-
-    def _coarse_samples(
-        self, origins: Float[Tensor, "batch ray 3"], noise: Float[Tensor, "batch ray coarse"] | None
-    ) -> Float[Tensor, "batch ray coarse"]:
-        batch_size, num_rays = origins.shape[:2]
-        flat = None if noise is None else noise.flatten(0, 1)
-        t = stratified_samples(self.near, self.far, self.num_coarse_samples, batch_size * num_rays, flat)
-        return t.to(origins).view(batch_size, num_rays, self.num_coarse_samples)
-
-    def _fine_samples(
-        self,
-        t_coarse: Float[Tensor, "batch ray coarse"],
-        weights: Float[Tensor, "batch ray coarse"],
-        quantiles: Float[Tensor, "batch ray fine"] | None,
-    ) -> Float[Tensor, "batch ray fine"]:
-        # As jaxnerf: bins between the midpoints of coarse samples, so the first and last weight have none.
-        middles = ((t_coarse[..., 1:] + t_coarse[..., :-1]) / 2).flatten(0, 1)
-        if quantiles is None:
-            u = even_quantiles(self.num_fine_samples, len(middles), middles.device)
-        else:
-            u = quantiles.flatten(0, 1)
-        t_fine = sample_pdf(middles, weights[..., 1:-1].flatten(0, 1), u)
-        return t_fine.view(*t_coarse.shape[:-1], self.num_fine_samples)
+        return composited_rays(sigmas, rgbs, t, self.far, coarse_rgbs)
 
     def _evaluate(
         self,
@@ -311,27 +319,5 @@ class PointNeRFRenderer(AbstractRenderer):
             features_backend=self.features_backend,
             is_sorted=self.sort_particles,
             is_recomputed=self.checkpoint_chunks,
+            variant=self.variant,
         )
-
-    def _ends(self, t: Float[Tensor, "batch ray sample"]) -> Float[Tensor, "batch ray sample"]:
-        """Each sample stands for the way to the next one, the last for the way to the far plane."""
-        return torch.cat([t[..., 1:], torch.full_like(t[..., :1], self.far)], dim=-1)
-
-
-def _points(
-    origins: Float[Tensor, "batch ray 3"],
-    directions: Float[Tensor, "batch ray 3"],
-    t: Float[Tensor, "batch ray sample"],
-) -> Float[Tensor, "batch ray sample 3"]:
-    with full_precision(t):
-        return origins[..., None, :] + t[..., None] * directions[..., None, :]
-
-
-def _closed(
-    weights: Float[Tensor, "batch ray sample"],
-    transmittance: Float[Tensor, "batch ray"],
-    rgbs: Float[Tensor, "batch ray sample 3"],
-) -> Float[Tensor, "batch ray 3"]:
-    """Return the colour of each ray, with the left-over light going to the last sample's colour."""
-    with full_precision(weights):
-        return (weights[..., None] * rgbs).sum(dim=-2) + transmittance[..., None] * rgbs[..., -1, :]

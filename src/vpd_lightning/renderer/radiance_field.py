@@ -28,7 +28,8 @@ class RadianceField(nn.Module):
     # is zero at every location: an invisible scene without gradients. Starting from thin fog cannot die like that.
     # Paper: jaxnerf without view directions takes the colour straight from the trunk. The paper says that both of its
     # networks have eight layers of 256 "followed by 1 layer of width 128", so without view directions the colour
-    # branch is that layer and three sigmoids (no bottleneck, which only serves to meet the directions).
+    # branch is that layer and three sigmoids (no bottleneck, which only serves to meet the directions). With
+    # ``net_width_condition`` ``None`` it is jaxnerf's: three sigmoids on the trunk.
 
     Parameters at the paper's size (64 features in): trunk 64*256 + 256*256*4 + 320*256 + 256*256*2 weights, 8*256
     biases; density 256 + 1. Coarse colour 256*128 + 128 + 128*3 + 3: 527,108 in all. Fine colour 256*256 + 256 +
@@ -42,15 +43,17 @@ class RadianceField(nn.Module):
         net_depth: int,
         net_width: int,
         skip_layer: int,
-        net_width_condition: int,
+        net_width_condition: int | None,
         view_degree: int | None,
         density_activation: str,
         initial_density: float,
     ) -> None:
         super().__init__()
         sizes = {"input_dim": input_dim, "net_depth": net_depth, "net_width": net_width, "skip_layer": skip_layer}
+        if net_width_condition is None and view_degree is not None:
+            raise ValueError("net_width_condition must be given where there are view directions: they enter there.")
         for name, value in (sizes | {"net_width_condition": net_width_condition}).items():
-            if value < 1:
+            if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}.")
         if view_degree is not None and view_degree < 0:
             raise ValueError(f"view_degree must be at least 0, or null for no view directions, got {view_degree}.")
@@ -72,8 +75,9 @@ class RadianceField(nn.Module):
         self.density = nn.Linear(net_width, 1)
         self.bottleneck = None if view_degree is None else nn.Linear(net_width, net_width)
         view_dim = 0 if view_degree is None else encoding_dim(view_degree)
-        self.condition = nn.Linear(net_width + view_dim, net_width_condition)
-        self.color = nn.Linear(net_width_condition, 3)
+        has_condition = net_width_condition is not None
+        self.condition = nn.Linear(net_width + view_dim, net_width_condition) if has_condition else None
+        self.color = nn.Linear(net_width_condition if has_condition else net_width, 3)
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 # jaxnerf: Glorot uniform weights, zero biases.
@@ -90,18 +94,31 @@ class RadianceField(nn.Module):
         features: Float[Tensor, "*batch sample feature"],
         directions: Float[Tensor, "*batch 3"] | None,
         use_color: bool = True,
+        scenes: Float[Tensor, "scene latent"] | None = None,
     ) -> tuple[Float[Tensor, "*batch sample"], Float[Tensor, "*batch sample 3"] | None]:
         """Return densities (per unit of length, >= 0) and colours in [0, 1], both in at least float32.
 
-        ``directions`` are unit vectors, one per ray. Without ``use_color`` the colour branch is left out.
+        ``directions`` are unit vectors, one per ray. Without ``use_color`` the colour branch is left out. ``scenes``
+        is the last part of the input where all samples of a scene share it; scenes are the first axis of ``batch``.
+        What the layers make of it is computed once per scene: the same sum as for features with it concatenated.
         """
         # Under autocast the first product rounds the features; the skip connection then takes the rounded ones too.
         features = features.to(_product_dtype(features))
-        hidden = features
-        for layer, takes_input in zip(self.trunk, self.takes_input, strict=True):
-            hidden = (_two_inputs(layer, hidden, features) if takes_input else layer(hidden)).relu_()
+        shape = features.shape[:-1]
+        # One row per sample, so that what ReLU overwrites is no view: its gradient would be copied at every layer.
+        hidden = _of_input(self.trunk[0], 0, features, scenes).relu_().flatten(0, -2)
+        for layer, takes_input in list(zip(self.trunk, self.takes_input, strict=True))[1:]:
+            hidden = (_two_inputs(layer, hidden, features, scenes) if takes_input else layer(hidden)).relu_()
         if not use_color:
-            return self._activated(self.density(hidden)), None
+            return self._activated(self.density(hidden)).unflatten(0, shape), None
+        if self.condition is None:
+            heads = functional.linear(
+                hidden,
+                torch.cat([self.color.weight, self.density.weight]),
+                torch.cat([self.color.bias, self.density.bias]),
+            )
+            heads = heads.unflatten(0, shape)
+            return self._activated(heads[..., 3:]), torch.sigmoid(at_least_float32(heads[..., :3]))
         weight, bias = self.condition.weight, self.condition.bias
         along_ray = None
         if self.bottleneck is not None and self.view_degree is not None:
@@ -118,7 +135,7 @@ class RadianceField(nn.Module):
         # Density and colour branch read the trunk in one product.
         heads = functional.linear(
             hidden, torch.cat([weight, self.density.weight]), torch.cat([bias, self.density.bias])
-        )
+        ).unflatten(0, shape)
         hidden, raw_density = heads[..., :-1], heads[..., -1:]
         hidden = functional.relu(hidden if along_ray is None else hidden + along_ray.to(hidden.dtype))
         return self._activated(raw_density), torch.sigmoid(at_least_float32(self.color(hidden)))
@@ -134,11 +151,23 @@ def _product_dtype(tensor: Tensor) -> torch.dtype:
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else tensor.dtype
 
 
-def _two_inputs(layer: nn.Linear, first: Tensor, second: Tensor) -> Tensor:
-    """Apply ``layer`` to the concatenation of two inputs without writing the concatenation down."""
-    width = first.shape[-1]
-    # Under autocast products in place take what they are given, so the weights are rounded here.
-    weight = layer.weight.to(first.dtype)
-    total = functional.linear(second, weight[:, width:], layer.bias.to(first.dtype))
-    total.flatten(0, -2).addmm_(first.flatten(0, -2), weight[:, :width].t())
-    return total
+def _of_input(layer: nn.Linear, start: int, features: Tensor, scenes: Tensor | None) -> Tensor:
+    """Return what ``layer`` makes of the network's input, which its weights take from column ``start`` on.
+
+    Of axes ``row width``, or ``scene row width`` where there are scenes.
+    """
+    # Under autocast the sums below take what they are given, so the weights are rounded here.
+    weight, bias = layer.weight.to(features.dtype), layer.bias.to(features.dtype)
+    if scenes is None:
+        return functional.linear(features.flatten(0, -2), weight[:, start:], bias)
+    stop = start + features.shape[-1]
+    once = functional.linear(scenes.to(features.dtype), weight[:, stop:], bias)
+    shared = weight[:, start:stop].t().expand(len(scenes), -1, -1)
+    return torch.baddbmm(once[:, None], features.flatten(1, -2), shared)
+
+
+def _two_inputs(layer: nn.Linear, hidden: Tensor, features: Tensor, scenes: Tensor | None) -> Tensor:
+    """Apply ``layer`` to the concatenation of ``hidden`` and the input without writing the concatenation down."""
+    width = hidden.shape[-1]
+    weight = layer.weight[:, :width].to(hidden.dtype)
+    return torch.addmm(_of_input(layer, width, features, scenes).flatten(0, -2), hidden, weight.t())

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vpd_lightning.renderer.neighbor_features import NeighborFeatures
 from vpd_lightning.renderer.point_features import kernel_weights, safe_norm
 from vpd_lightning.renderer.precision import at_least_float32, full_precision
 from vpd_lightning.renderer.ray_search import BesideRay, Candidates, RaySearch, resolved_backend
@@ -21,6 +22,7 @@ class RayCandidates:
     across: Float[Tensor, "batch ray candidate"]
     features: Float[Tensor, "batch ray candidate feature"]
     mask: Bool[Tensor, "batch ray candidate"]
+    offsets: Float[Tensor, "batch ray candidate 3"]  # from the ray's origin
 
 
 class CandidateTable:
@@ -65,7 +67,7 @@ class CandidateTable:
             offset = gathered[..., :3] - origins
             along = (offset * directions).sum(dim=-1)
             across = safe_norm(offset - along[..., None] * directions)
-            return RayCandidates(along, across, gathered[..., 3:], found.mask)
+            return RayCandidates(along, across, gathered[..., 3:], found.mask, offset)
 
 
 def ray_features(
@@ -103,6 +105,30 @@ def ray_features(
         rows = weights.transpose(-1, -2).flatten(2, 3).flatten(0, 1)
         summed = torch.bmm(rows, candidates.features.flatten(0, 1))
         return summed.view(*t.shape, len(kernel_radii) * candidates.features.shape[-1])
+
+
+def ray_neighbor_features(
+    candidates: RayCandidates,
+    t: Float[Tensor, "batch ray sample"],
+    directions: Float[Tensor, "batch ray 3"],
+    num_neighbors: int,
+    variant: NeighborFeatures,
+) -> Float[Tensor, "batch ray sample kernel_feature"]:
+    """Return other features than the plain ones, of the same neighbours as ``ray_features`` takes."""
+    with full_precision(t):
+        behind = (t[..., None] - candidates.along[..., None, :]).detach()
+        squared = candidates.across.detach().square()[..., None, :] + behind.square()
+        squared = squared.masked_fill(~candidates.mask[..., None, :], torch.inf)
+        nearest, index = squared.topk(min(num_neighbors, squared.shape[-1]), dim=-1, largest=False)
+        num_candidates = candidates.along.shape[-1]
+        rays = torch.arange(len(index.flatten(0, 1)), device=t.device).view(*t.shape[:2], 1, 1)
+        row = (rays * num_candidates + index).flatten(0, 2)
+        offsets = candidates.offsets.flatten(0, 2).index_select(0, row.flatten()).view(*row.shape, 3)
+        latents = candidates.features.flatten(0, 2).index_select(0, row.flatten()).unflatten(0, row.shape)
+        along = (t[..., None] * directions.to(t.dtype)[:, :, None]).flatten(0, 2)
+        offsets = along[:, None] - offsets
+    found = variant(offsets, latents, torch.isfinite(nearest).flatten(0, 2))
+    return found.unflatten(0, t.shape)
 
 
 @torch.no_grad()

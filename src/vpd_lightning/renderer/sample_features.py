@@ -9,6 +9,7 @@ from torch import Tensor
 from vpd_lightning.graph.neighbors import Neighbors
 from vpd_lightning.renderer.chunked_rays import recomputed
 from vpd_lightning.renderer.fused_features import fused_annular_features
+from vpd_lightning.renderer.neighbor_features import NeighborFeatures, gathered_neighbors
 from vpd_lightning.renderer.particle_search import ParticleSearch, morton_sorted
 from vpd_lightning.types import Particles
 
@@ -19,7 +20,8 @@ class SampleFeatures:
     ``max_radius`` (metres, ``None``: no limit) leaves out what is farther, see ``bounds.feature_error_bound``.
     ``is_recomputed`` keeps, of all that lies between particles and features, only the neighbours' indices for the
     backward pass. A fused backend does that by itself; to sum once more costs it next to nothing, and ``auto`` may have
-    to fall back to one that keeps everything.
+    to fall back to one that keeps everything. ``variant`` may make the features others than the paper's, which no fused
+    backend computes; ``None`` is the paper's.
     """
 
     def __init__(
@@ -34,6 +36,7 @@ class SampleFeatures:
         features_backend: str,
         is_sorted: bool,
         is_recomputed: bool,
+        variant: NeighborFeatures | None,
     ) -> None:
         # Padding may hold anything, and index 0 stands for "no neighbour" too: what it holds must at least be finite.
         mask = particles.mask[..., None]
@@ -50,6 +53,7 @@ class SampleFeatures:
         self._kernels = (kernel_radii, kernel_bandwidths)
         self._features_backend = features_backend
         self._is_recomputed = is_recomputed
+        self._variant = variant
 
     def __call__(self, points: Float[Tensor, "batch ray sample 3"]) -> Float[Tensor, "batch ray sample feature"]:
         """Return the features of every sample of every ray."""
@@ -74,6 +78,8 @@ class SampleFeatures:
     def _summed(
         self, points: Float[Tensor, "row 3"], particles: Particles, neighbors: Neighbors
     ) -> Float[Tensor, "row feature"]:
+        if self._variant is not None and not self._variant.is_plain:
+            return self._variant(*gathered_neighbors(points, particles, neighbors))
         return fused_annular_features(points, particles, neighbors, *self._kernels, self._features_backend)
 
 

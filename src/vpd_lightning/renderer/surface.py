@@ -10,12 +10,21 @@ from torch import Tensor, nn
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.chunked_rays import joined, ray_slices, recomputed, uniform_draws
+from vpd_lightning.renderer.feature_network import FeatureNetwork
+from vpd_lightning.renderer.neighbor_features import NeighborFeatures
 from vpd_lightning.renderer.point_features import check_kernels
 from vpd_lightning.renderer.positional_encoding import encoding_dim, positional_encoding
 from vpd_lightning.renderer.precision import at_least_float32, full_precision
 from vpd_lightning.renderer.radiance_field import RadianceField
-from vpd_lightning.renderer.ray_candidates import CandidateTable, RayCandidates, depth_hints, ray_features
+from vpd_lightning.renderer.ray_candidates import (
+    CandidateTable,
+    RayCandidates,
+    depth_hints,
+    ray_features,
+    ray_neighbor_features,
+)
 from vpd_lightning.renderer.ray_search import Candidates, check_backend
+from vpd_lightning.renderer.sample_features import SampleFeatures
 from vpd_lightning.renderer.volumetric import composite
 from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
@@ -33,7 +42,8 @@ class SurfaceRenderer(AbstractRenderer):
     # of the viewing direction.
 
     ``footprint`` (metres) is how far across a ray a particle may stop light; ``None`` takes the narrowest kernel
-    bandwidth, which the paper's tables set to about the distance between particles.
+    bandwidth, which the paper's tables set to about the distance between particles. ``kernel_normalization``,
+    ``normalization_epsilon`` and ``feature_network`` make other features, see ``NeighborFeatures``.
     """
 
     def __init__(
@@ -56,6 +66,9 @@ class SurfaceRenderer(AbstractRenderer):
         net_width_condition: int,
         view_degree: int,
         density_activation: str,
+        kernel_normalization: str | None,
+        normalization_epsilon: float,
+        feature_network: FeatureNetwork | None,
         background_width: int,
         ray_chunk_size: int,
         checkpoint_chunks: bool,
@@ -80,6 +93,14 @@ class SurfaceRenderer(AbstractRenderer):
         self.footprint = float(min(kernel_bandwidths) if footprint is None else footprint)
         if not (self.footprint > 0 and hint_spread > 0):
             raise ValueError(f"footprint and hint_spread must be greater than 0, got {footprint} and {hint_spread}.")
+        self.variant = NeighborFeatures(
+            feature_dim=feature_dim,
+            kernel_radii=kernel_radii,
+            kernel_bandwidths=kernel_bandwidths,
+            kernel_normalization=kernel_normalization,
+            normalization_epsilon=normalization_epsilon,
+            feature_network=feature_network,
+        )
         self.num_neighbors, self.num_candidates = num_neighbors, num_candidates
         self.num_samples, self.num_uniform_samples = num_samples, num_uniform_samples
         self.kernel_radii = tuple(float(radius) for radius in kernel_radii)
@@ -134,19 +155,39 @@ class SurfaceRenderer(AbstractRenderer):
             parts.append(self._render(candidates, some, noise[:, chunk]))
         return joined(parts)
 
+    def point_features(
+        self, particles: Particles, queries: Float[Tensor, "batch query 3"]
+    ) -> Float[Tensor, "batch query feature"]:
+        """Return what the field is given at points of the scene (metres): there, all particles are candidates."""
+        features = SampleFeatures(
+            particles.without_padding(),
+            num_neighbors=self.num_neighbors,
+            kernel_radii=self.kernel_radii,
+            kernel_bandwidths=self.kernel_bandwidths,
+            max_radius=None,
+            neighbors_backend="auto",
+            features_backend="auto",
+            is_sorted=True,
+            is_recomputed=self.checkpoint_chunks,
+            variant=self.variant,
+        )
+        return features(queries[:, :, None])[:, :, 0]
+
     def _render(self, candidates: RayCandidates, rays: Rays, noise: Float[Tensor, "batch ray draw"]) -> RenderedRays:
         t = self._samples(candidates, noise.to(candidates.along.dtype))
         directions = at_least_float32(rays.directions)
 
-        def seen(along: Tensor, across: Tensor, latents: Tensor) -> tuple[Tensor, Tensor]:
-            some = RayCandidates(along, across, latents, candidates.mask)
+        def seen(along: Tensor, across: Tensor, latents: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+            some = RayCandidates(along, across, latents, candidates.mask, offsets)
             kernels = self.kernel_radii, self.kernel_bandwidths
-            features = ray_features(some, t, self.num_neighbors, *kernels, self.candidate_backend)
+            if self.variant.is_plain:
+                features = ray_features(some, t, self.num_neighbors, *kernels, self.candidate_backend)
+            else:
+                features = ray_neighbor_features(some, t, directions, self.num_neighbors, self.variant)
             return self.field(features, directions)
 
-        sigmas, rgbs = recomputed(
-            seen, candidates.along, candidates.across, candidates.features, is_enabled=self.checkpoint_chunks
-        )
+        parts = candidates.along, candidates.across, candidates.features, candidates.offsets
+        sigmas, rgbs = recomputed(seen, *parts, is_enabled=self.checkpoint_chunks)
         t_starts, t_ends = self._intervals(t)
         rgb, weights, transmittance = composite(sigmas / self.footprint, rgbs, t_starts, t_ends)
         with full_precision(t):

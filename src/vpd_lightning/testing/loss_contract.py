@@ -97,7 +97,9 @@ def _slice(value: Tensor | None, index: int) -> Any:
 def _member_output(output: SimulatorOutput, index: int) -> SimulatorOutput:
     rendered = output.rendered
     return SimulatorOutput(
-        RenderedRays(
+        None
+        if rendered is None
+        else RenderedRays(
             _slice(rendered.rgbs, index),
             _slice(rendered.depths, index),
             _slice(rendered.opacities, index),
@@ -116,4 +118,5 @@ def _member_batch(batch: VideoBatch, index: int) -> VideoBatch:
         rgbs=batch.rgbs[some],
         keys=replace(batch.keys, sample_index=[batch.keys.sample_index[index]]),
         clips=[batch.clips[index]],
+        future=None if batch.future is None else batch.future[some],
     )

@@ -1,0 +1,144 @@
+"""From pixels with a depth to particles: unproject, crop to the workspace, subsample (paper section 3.1)."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from vpd_lightning.encoder.background import BackgroundModel
+from vpd_lightning.encoder.base import AbstractEncoder
+from vpd_lightning.errors import EmptyWorkspaceError
+from vpd_lightning.geometry.cameras import unproject
+from vpd_lightning.geometry.normals import depth_normals
+from vpd_lightning.geometry.workspace import choose, inside_workspace
+from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.types import Particles, RGBDFrames, require_finite
+
+
+class UnprojectingEncoder(AbstractEncoder):
+    """What encoders share whose particles are pixels: which pixels, and where they lie. A subclass brings features.
+
+    ``num_particles`` are chosen uniformly at random among the pixels inside the workspace. With ``moving_fraction``
+    (and a ``background`` model) that share of them is chosen among pixels that may be moving.
+    """
+
+    # Paper: moving_fraction, background and use_normals are ours; None, None, False is the paper.
+
+    # What a person is told to look at where no pixel lies in the workspace.
+    _empty_advice = "Check depth (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."
+
+    def __init__(
+        self,
+        *,
+        network: nn.Module,
+        feature_dim: int,
+        num_particles: int,
+        workspace_min: Sequence[float],
+        workspace_max: Sequence[float],
+        moving_fraction: float | None,
+        background: BackgroundModel | None,
+        use_normals: bool,
+    ):
+        super().__init__()
+        if num_particles < 1:
+            raise ValueError(f"num_particles must be at least 1, got {num_particles}")
+        if any(low >= high for low, high in zip(workspace_min, workspace_max, strict=True)):
+            raise ValueError(f"workspace_min {list(workspace_min)} must lie below workspace_max {list(workspace_max)}")
+        if moving_fraction is not None and background is None:
+            raise ValueError("moving_fraction needs a background model; set encoder.background or moving_fraction=null")
+        if moving_fraction is not None and not 0 < moving_fraction < 1:
+            raise ValueError(f"moving_fraction must lie between 0 and 1, got {moving_fraction}")
+        self.network = network
+        self.feature_dim = feature_dim
+        self.num_particles = num_particles
+        self.workspace_min, self.workspace_max = list(workspace_min), list(workspace_max)
+        self.moving_fraction = moving_fraction
+        self.background = background
+        self.use_normals = use_normals
+
+    @staticmethod
+    def _colors(frames: RGBDFrames) -> Float[Tensor, "batch view height width 3"]:
+        """Return the images in [0, 1].
+
+        Raises:
+            NonFiniteError: an image or a camera is not finite.
+        """
+        rgb = frames.rgb if frames.rgb.is_floating_point() else frames.rgb.to(frames.depth.dtype) / 255
+        cameras = frames.cameras
+        require_finite(
+            "Encoder", rgb=rgb, cameras=torch.cat([cameras.intrinsics.flatten(), cameras.cam_to_world.flatten()])
+        )
+        return rgb
+
+    @staticmethod
+    def _activate(outputs: Tensor, dtype: torch.dtype) -> Tensor:
+        # Kernel sums and positions downstream stay in full precision, whatever autocast did to the convolutions.
+        return torch.nn.functional.softplus(outputs.to(dtype))
+
+    def _particles(
+        self, frames: RGBDFrames, features_at: Callable[[Tensor], Tensor], keys: RandomKeys, purpose: str
+    ) -> Particles:
+        """Return particles at pixels of the frames (axes ``batch view``), whose colours are in [0, 1].
+
+        ``features_at`` gives the features of the chosen pixels; its argument (``batch particle``) counts over
+        ``view height width`` of each member. Gradients reach the depth, where it has any.
+
+        Raises:
+            EmptyWorkspaceError: no pixel of a batch member lies in the workspace.
+        """
+        points = unproject(frames.depth, frames.cameras).flatten(1, 3)
+        measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
+        candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
+        moving = None
+        if self.background is not None:
+            moving, border = (pixels.flatten(1) for pixels in _with_border(self.background(frames)))
+            candidates = candidates & ~border
+        index, valid = self._choose(candidates, moving, keys, purpose)
+
+        points = torch.where(candidates[..., None], points, torch.zeros_like(points))  # no NaN through padding
+
+        def take(values: Tensor) -> Tensor:
+            return torch.gather(values, 1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+        return Particles(
+            positions=take(points) * valid[..., None],
+            features=features_at(index) * valid[..., None],
+            mask=valid,
+            colors=take(frames.rgb.flatten(1, 3)),
+            moving=None if moving is None else torch.gather(moving, 1, index) & valid,
+            normals=take(depth_normals(frames.depth, frames.cameras).flatten(1, 3)) if self.use_normals else None,
+        )
+
+    def _choose(
+        self, candidates: Bool[Tensor, "batch point"], moving: Tensor | None, keys: RandomKeys, purpose: str
+    ) -> tuple[Tensor, Tensor]:
+        indices, valids = [], []
+        for member, generator in enumerate(keys.generators(f"particles/{purpose}")):
+            allowed = candidates[member]
+            if not bool(allowed.any()):
+                low, high = self.workspace_min, self.workspace_max
+                raise EmptyWorkspaceError(
+                    f"no measured pixel of batch member {member} lies in the workspace {low} to {high}.\n"
+                    f"{self._empty_advice}"
+                )
+            if self.moving_fraction is None or moving is None:
+                index, valid = choose(allowed, self.num_particles, generator)
+            else:
+                num_moving = round(self.moving_fraction * self.num_particles)
+                moving_index, moving_valid = choose(allowed & moving[member], num_moving, generator)
+                index, valid = choose(allowed & ~moving[member], self.num_particles - num_moving, generator)
+                index, valid = torch.cat([moving_index, index]), torch.cat([moving_valid, valid])
+            indices.append(index)
+            valids.append(valid)
+        return torch.stack(indices), torch.stack(valids)
+
+
+def _with_border(moving: Bool[Tensor, "batch view height width"]) -> tuple[Tensor, Tensor]:
+    """Return the moving pixels and those beside them that are not.
+
+    At a body's foot its depth hardly differs from what stands behind: such a pixel is neither surely moving nor surely
+    static, and with a normal between the two it would be a false wall. It becomes no particle.
+    """
+    grown = torch.nn.functional.max_pool2d(moving.float(), 3, stride=1, padding=1) > 0
+    return moving, grown & ~moving
