@@ -5,6 +5,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,33 @@ def _train(argv: list[str]) -> int:
     if arguments.is_question:
         answer("train", argv)
         return 0
+    from vpd_lightning.commands.sweeps import is_named_sweep
+
+    if not is_named_sweep(arguments.overrides):
+        return _train_as_told(arguments)
+    if not arguments.is_multirun:
+        raise ConfigError("sweep=NAME is for many runs.\nAdd -m: vpd-train -m sweep=NAME ...")
+    return _train_sweep(arguments)
+
+
+def _train_sweep(arguments: Arguments) -> int:
+    """All jobs of a named sweep, as far as they are not done."""
+    from vpd_lightning.commands.sweeps import run_sweep, sweep_jobs
+
+    jobs = sweep_jobs(arguments.overrides, arguments.config_dir)
+    for job in jobs:
+        _refuse_several_devices(job.config["trainer"])
+        _check_sections(job.config)
+    flags = [flag for flag in arguments.flags if flag not in ("-m", "--multirun")]
+
+    def train(words: list[str]) -> None:
+        _train_as_told(replace(arguments, overrides=words, flags=flags, is_multirun=False))
+
+    return run_sweep(jobs, train, _show)
+
+
+def _train_as_told(arguments: Arguments) -> int:
+    """One run, or with -m one for each combination of the values that are listed."""
     from vpd_lightning.commands.resume import resumed_overrides, wants_auto
     from vpd_lightning.config import compose, expand_sweep
 
@@ -73,11 +101,14 @@ def _show(error: Exception) -> None:
 
 def _check_sections(config: dict[str, Any]) -> None:
     """Refuse, before a folder is made, classes that may not be built, arguments they do not take, unequal widths."""
-    from vpd_lightning.config import check_targets, check_widths
+    from vpd_lightning.config import check_targets, check_widths, pretraining_config
 
-    for section in SECTIONS:
-        check_targets(config[section], section)
-    check_widths(config)
+    for part in (config, pretraining_config(config)):
+        if part is None:
+            continue
+        for section in SECTIONS:
+            check_targets(part[section], section)
+        check_widths(part)
 
 
 def _check_places(configs: Sequence[dict[str, Any]], overrides: Sequence[str], arguments: Arguments) -> None:
