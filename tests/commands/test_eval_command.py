@@ -1,14 +1,22 @@
 """``vpd-eval`` from its words to its files, and what it refuses."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
+import vpd_lightning
 from tests.evaluation.tossed_box import write_tossed_boxes
 from tests.evaluation.untrained_model import write_untrained
+from tests.released_model import write_slotformer
 from vpd_lightning.commands.eval import choose_protocol, main
+from vpd_lightning.commands.evaluation_run import run_evaluation, training_of
+from vpd_lightning.config import compose
 from vpd_lightning.errors import ConfigError
+from vpd_lightning.training.checkpoint_io import load_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -30,18 +38,66 @@ def test_an_evaluation_writes_everything_and_prints_its_path_last(
     assert lines[-1] == str(folder / "metrics.json")
     assert sorted(path.name for path in folder.iterdir()) == [
         "arrays.npz",
+        "config.yaml",
         "contact_sheet.png",
         "curves.png",
         "metrics.csv",
         "metrics.json",
+        "rollouts.npz",
         "videos",
     ]
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["step"] == 7 and len(metrics["checkpoint_sha256"]) == len(metrics["data_sha256"]) == 64
+    assert (metrics["system"], metrics["experiment"], metrics["seed"]) == ("vpd", metrics["model"], 0)
+    assert metrics["num_parameters"] == sum(p.numel() for p in vpd_lightning.load(checkpoint).parameters()) > 0
+    assert metrics["native"] is None and metrics["penetration"]["mean"] >= 0 and metrics["sharpness"]["mean"] > 0
+    assert yaml.safe_load((folder / "config.yaml").read_text()) == load_checkpoint(checkpoint)["hyper_parameters"]
+    assert metrics["training"]["checkpoint_name"] == "last.ckpt" and metrics["training"]["seconds"] is None
     assert metrics["protocol"]["num_steps"] == 3, "the run's own protocol"
     # Nothing moves in this model, so it is as wrong as predicting no motion.
     assert metrics["motion"]["centroid_error_over_copy"]["per_step"] == pytest.approx([1.0] * 3)
     assert metrics["long_rollout"]["num_steps"] == 20
+
+
+def test_the_time_is_that_of_the_checkpoint() -> None:
+    content = {
+        "callbacks": {"TimeBudget": {"seconds": 90.0, "seconds_before": 30.0, "steps": 12}},
+        "hyper_parameters": {"callbacks": {"time_budget": {"minutes": 2.0, "clock": "cpu"}}},
+        "global_step": 12,
+    }
+    assert training_of(content, Path("run/checkpoints/best.ckpt")) == {
+        "seconds": 120.0,
+        "seconds_before": 30.0,
+        "minutes_allowed": 2.0,
+        "clock": "cpu",
+        "steps": 12,
+        "checkpoint_name": "best.ckpt",
+        "data_sha256": None,
+    }
+    assert training_of({"hyper_parameters": {"callbacks": None}}, Path("a.ckpt"))["seconds"] is None
+
+
+def test_a_system_without_particles_is_evaluated_as_well(
+    tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_slotformer(tmp_path / "run")
+    words = [f"ckpt={path}", f"data.folder={data}", "num_videos=1", "protocol.num_steps=3"]
+    assert main([*words, "protocol.start_frames=[2]"]) == 2
+    assert "looks at 6 frames" in capsys.readouterr().err
+    assert main([*words, "protocol.start_frames=[4]"]) == 0
+    metrics = json.loads((tmp_path / "run" / "evaluation" / "metrics.json").read_text())
+    assert metrics["system"] == "slotformer" and metrics["native"]["resolution"] == 16
+    assert metrics["finite"] and metrics["chamfer"] is None and metrics["psnr"]["count"] == 3 * 2 * 3
+    assert "at its own 16x16 pixels" in capsys.readouterr().out
+
+
+def test_a_model_that_predicts_depth_is_evaluated_without_any(tmp_path: Path, data: Path) -> None:
+    depth = ("encoder=unet_depth_small", "encoder.channels=[4,8,4]", "encoder.initial_depth=1.9")
+    path = write_untrained(tmp_path / "run", data, *depth)
+    words = [f"ckpt={path}", "hide_depth=true", "num_videos=0", "protocol.num_trajectories=1"]
+    assert main([*words, "protocol.num_long_steps=0"]) == 0
+    metrics = json.loads((tmp_path / "run" / "evaluation" / "metrics.json").read_text())
+    assert metrics["hide_depth"] is True and metrics["finite"] and metrics["chamfer"]["mean"] > 0
 
 
 def test_a_second_evaluation_does_not_overwrite_the_first(checkpoint: Path) -> None:
@@ -67,6 +123,7 @@ def test_a_second_evaluation_does_not_overwrite_the_first(checkpoint: Path) -> N
         (["num_videos=-1"], 2, "num_videos=-1"),
         (["num_threads=0"], 2, "num_threads=0"),
         (["device=tpu9"], 2, "device"),
+        (["hide_depth=true"], 3, "no measured pixel"),
         (["data.folder=nowhere"], 3, "vpd-data generate"),
         (["out={folder}"], 2, "exists already"),
     ],
@@ -79,6 +136,33 @@ def test_bad_words_get_a_named_error(
     error = capsys.readouterr().err
     assert message in error and len(error.strip().splitlines()) <= 5
     assert [path.name for path in checkpoint.parents[1].iterdir()] == ["checkpoints"], "nothing stays behind"
+
+
+@pytest.mark.parametrize("is_made", [True, False])
+def test_a_data_set_that_is_gone_is_made_again_where_the_training_would_make_it(
+    tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch, is_made: bool
+) -> None:
+    gone = tmp_path / "gone"
+    words = ["generate.scene=mujoco_block", f"generate.when_missing={is_made}"]
+    checkpoint = write_untrained(tmp_path / "run", gone, *words)
+    asked: list[Path] = []
+
+    def provide(config: Mapping[str, Any]) -> None:
+        asked.append(Path(config["data"]["folder"]))
+        gone.symlink_to(data)
+
+    monkeypatch.setattr("vpd_lightning.commands.evaluation_run.provide_data", provide)
+    code = main([f"ckpt={checkpoint}", "num_videos=0", "protocol.num_trajectories=1", "protocol.num_long_steps=0"])
+    assert (code, asked) == ((0, [gone]) if is_made else (3, []))
+
+
+def test_a_training_can_be_followed_by_its_evaluation(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [f"ckpt='{checkpoint}'", f"out='{tmp_path / 'here'}'", "num_videos=0", "protocol.num_long_steps=0"]
+    path = run_evaluation(compose("eval", words))
+    assert path == tmp_path / "here" / "metrics.json" and path.is_file()
+    assert "PSNR (dB)" in capsys.readouterr().out
 
 
 def test_a_missing_checkpoint_is_a_checkpoint_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

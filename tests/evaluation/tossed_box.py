@@ -150,3 +150,17 @@ class Oracle:
             pose = self.pose(number, frame).numpy()
             images.append(np.stack([draw(pose[:3], pose[3:], view)[0] for view in range(cameras.shape[0])]))
         return torch.from_numpy(np.stack(images)).float() / 255.0
+
+
+class Swaying(Oracle):
+    """An oracle whose particles sway by centimetres and swell, and whose images are too dark: every metric is busy."""
+
+    def rollout(self, scene: Scene, num_steps: int) -> list[Particles]:
+        states = []
+        for step, state in enumerate(super().rollout(scene, num_steps), start=1):
+            sway = 0.02 * torch.sin(7.0 * state.positions.roll(1, dims=-1) + step)
+            states.append(Particles(state.positions * (1 + 0.01 * step) + sway, state.features))
+        return states
+
+    def render(self, states: Sequence[Particles], cameras: Cameras) -> torch.Tensor:
+        return 0.9 * super().render(states, cameras)

@@ -48,10 +48,54 @@ def test_ssim_equals_scikit_image_per_image() -> None:
         assert values[index].item() == pytest.approx(reference, abs=1e-6)
 
 
-def test_ssim_in_float32_agrees_with_float64() -> None:
-    pred, target = image_pair(1, 24, 24)
-    # The variance is a difference of two near squares, each accurate to 1e-7.
-    torch.testing.assert_close(ssim(pred.float(), target.float()).double(), ssim(pred, target), atol=1e-4, rtol=0)
+def photographs(size: int) -> dict[str, torch.Tensor]:
+    """Images of several kinds: noise, smooth, nearly flat and bright, half black and half white."""
+    generator = torch.Generator().manual_seed(size)
+    noise = torch.rand(size, size, 3, generator=generator)
+    row, column = torch.meshgrid(torch.linspace(0, 1, size), torch.linspace(0, 1, size), indexing="ij")
+    flat = torch.full((size, size, 3), 0.93)
+    flat[size // 4 : size // 3, size // 4 : size // 2] = 0.2
+    return {
+        "noise": noise,
+        "smooth": torch.stack([row, column, 0.5 + 0.5 * torch.sin(9 * row * column)], -1),
+        "flat": flat,
+        "halves": (column > 0.5).float()[..., None].expand(-1, -1, 3).contiguous(),
+    }
+
+
+@pytest.mark.parametrize("size", [64, 128])
+@pytest.mark.parametrize("kind", ["noise", "smooth", "flat", "halves"])
+def test_float32_metrics_equal_scikit_image_in_float64(size: int, kind: str) -> None:
+    target = photographs(size)[kind]
+    blur = 0.7 * target + 0.3 * target.roll(1, 0)
+    pred = (blur + 0.02 * torch.randn(target.shape, generator=torch.Generator().manual_seed(1))).clamp(0, 1)
+    pair = target.double().numpy(), pred.double().numpy()
+    expected = structural_similarity(
+        *pair, channel_axis=-1, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+    )
+    assert ssim(pred, target).item() == pytest.approx(expected, abs=1e-5)
+    assert psnr(pred, target).item() == pytest.approx(peak_signal_noise_ratio(*pair, data_range=1.0), abs=1e-5)
+
+
+def test_ssim_is_symmetric_and_one_for_the_same_image() -> None:
+    pred, target = image_pair(3, 24, 24, dtype=torch.float32)
+    torch.testing.assert_close(ssim(pred, target), ssim(target, pred))
+    torch.testing.assert_close(ssim(target, target), torch.ones(3))
+
+
+def test_a_constant_error_of_a_tenth_is_20_decibels_whatever_the_batch() -> None:
+    target = 0.8 * torch.rand(16, 12, 12, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(psnr(target + 0.1, target), torch.full((16,), 20.0), atol=1e-4, rtol=0)
+    pred = (target + 0.1 * torch.rand(16, 1, 1, 1)).clamp(0, 1)
+    whole, parts = psnr(pred, target), [torch.cat([psnr(*pair) for pair in batches(pred, target, n)]) for n in (1, 3)]
+    assert all(torch.equal(part, whole) for part in parts), "one number per image, and no image knows of another"
+    whole, parts = ssim(pred, target), [torch.cat([ssim(*pair) for pair in batches(pred, target, n)]) for n in (1, 3)]
+    for part in parts:
+        torch.testing.assert_close(part, whole, atol=1e-6, rtol=0)
+
+
+def batches(pred: torch.Tensor, target: torch.Tensor, size: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    return list(zip(pred.split(size), target.split(size), strict=True))
 
 
 def test_ssim_refuses_images_smaller_than_its_window() -> None:

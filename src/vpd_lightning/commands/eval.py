@@ -20,57 +20,10 @@ def _run(words: list[str]) -> int:
 
     config = configure("eval", words)
     if config is not None:
-        _evaluate(config)
+        from vpd_lightning.commands.evaluation_run import run_evaluation
+
+        run_evaluation(config)
     return 0
-
-
-def _evaluate(config: Mapping[str, Any]) -> None:
-    import torch
-
-    from vpd_lightning.commands.progress import show_progress
-    from vpd_lightning.data.manifest import file_sha256, load_manifest
-    from vpd_lightning.errors import OutOfMemoryError
-    from vpd_lightning.evaluation.evaluate import evaluate
-    from vpd_lightning.evaluation.gallery import write_gallery
-    from vpd_lightning.evaluation.report import metrics_of, write_metrics
-    from vpd_lightning.evaluation.summary import summary_lines
-    from vpd_lightning.export.output_folder import OutputFolder, beside_checkpoint, choose_folder
-    from vpd_lightning.loading import load_model
-
-    if config["num_videos"] < 0:
-        raise ConfigError(f"num_videos={config['num_videos']} is out of range.\nAllowed: 0 or more.")
-    set_threads(config["num_threads"])
-    model = load_model(config["ckpt"], config["device"], config["change"], sleeping=config["sleeping"])
-    protocol = choose_protocol(config["protocol"], model.config.get("protocol"))
-    manifest = load_manifest(data_folder(config["data"]["folder"], model.config))
-    name = "evaluation" if protocol.split == "test" else f"evaluation_{protocol.split}"
-    folder = choose_folder(config["out"], beside_checkpoint(model.path, name))
-    with OutputFolder(folder) as partial:
-        try:
-            with show_progress() as progress:
-                evaluation = evaluate(
-                    model.simulator, manifest, protocol, model.input_views, max(config["num_videos"], 2), progress
-                )
-        except torch.OutOfMemoryError as error:
-            raise OutOfMemoryError(
-                "The device ran out of memory while rendering.\nUse device=cpu, or a device with more memory."
-            ) from error
-        identity = {
-            "model": model.name,
-            "checkpoint": str(model.path),
-            "checkpoint_sha256": file_sha256(model.path),
-            "step": model.step,
-            "data": str(manifest.folder),
-            "data_sha256": manifest.digest,
-            "device": str(next(model.simulator.parameters()).device),
-        }
-        metrics = metrics_of(evaluation, protocol, identity)
-        write_gallery(partial, metrics, evaluation, config["num_videos"])
-        write_metrics(partial, metrics, evaluation)
-    print(f"{model.name}, step {model.step}: {model.path}")
-    print("\n".join(summary_lines(metrics)))
-    print()
-    print(folder / "metrics.json")
 
 
 def choose_protocol(wanted: Mapping[str, Any], of_run: Mapping[str, Any] | None) -> Any:

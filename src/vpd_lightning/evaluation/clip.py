@@ -1,49 +1,69 @@
-"""Predict one held-out clip and measure it."""
+"""Predict one held-out clip."""
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol as StructuralType
 from typing import runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
 from vpd_lightning.errors import ConfigError
-from vpd_lightning.evaluation.images import as_float, image_metrics, moving_pixels
-from vpd_lightning.evaluation.motion import chamfer_to_depth, clip_motion, trajectory_of
-from vpd_lightning.evaluation.protocol import Clip, Protocol
+from vpd_lightning.evaluation.motion import trajectory_of
+from vpd_lightning.evaluation.protocol import NUM_CONTEXT, Clip
+from vpd_lightning.geometry.resizing import resize_images
 from vpd_lightning.simulator import Scene
 from vpd_lightning.types import Cameras, Particles
-
-SYSTEMS = ("model", "copy_last", "train_mean")
 
 
 @runtime_checkable
 class PredictsVideo(StructuralType):
-    """What is evaluated: anything with the simulator's Python face."""
+    """A system of particles: anything with the simulator's Python face."""
 
     def encode(self, rgb: Tensor, depth: Tensor, cameras: Cameras) -> Scene: ...
     def rollout(self, scene: Scene, num_steps: int) -> list[Particles]: ...
     def render(self, states: Sequence[Particles], cameras: Cameras) -> Tensor: ...
 
 
+@runtime_checkable
+class PredictsViews(StructuralType):
+    """A system that continues the video of each view from that view's own frames, at a resolution of its own.
+
+    It sees the last ``num_context_frames`` frames. Images are square, colours float in [0, 1].
+    """
+
+    num_context_frames: int
+
+    def encode_views(self, rgb: UInt8[Tensor, "time view height width 3"]) -> Float[Tensor, "view time slot dim"]: ...
+    def rollout_views(
+        self, slots: Float[Tensor, "view time slot dim"], num_steps: int
+    ) -> Float[Tensor, "view step slot dim"]: ...
+    def decode(self, slots: Float[Tensor, "*shape slot dim"]) -> Float[Tensor, "*shape resolution resolution 3"]: ...
+
+
 @dataclass(frozen=True)
 class Prediction:
-    """A predicted clip. ``images`` are float colours in [0, 1], ``reconstruction`` the rendered last input frame."""
+    """A predicted clip. ``images`` are float colours in [0, 1], ``reconstruction`` the last input frame, decoded.
+
+    ``native`` are the images at the system's own resolution where it has one, of which ``images`` are enlarged;
+    ``positions`` are the particles (the last observed ones first) where the system has any.
+    """
 
     images: Float[Tensor, "step view height width 3"]
     reconstruction: Float[Tensor, "view height width 3"]
-    positions: Float[Tensor, "time particle 3"]
+    native: Float[Tensor, "step view resolution resolution 3"] | None
+    positions: Float[Tensor, "time particle 3"] | None
     seconds: dict[str, float]
 
     @property
     def finite(self) -> bool:
         """Whether every predicted colour and position is a number."""
-        return bool(torch.isfinite(self.images).all() and torch.isfinite(self.positions).all())
+        parts = [self.images] if self.positions is None else [self.images, self.positions]
+        return all(bool(torch.isfinite(part).all()) for part in parts)
 
     def images_uint8(self) -> NDArray[np.uint8]:
         """The predicted images as a screen shows them (what is not a number is black)."""
@@ -54,17 +74,19 @@ class Prediction:
         return _uint8(self.reconstruction)
 
 
-@dataclass(frozen=True)
-class ClipResult:
-    """What was measured: ``images[system][metric]`` (view, step), ``reconstruction[metric]`` (view, 1).
+def num_context_frames(system: PredictsVideo | PredictsViews) -> int:
+    """How many frames up to the last input frame a system must see."""
+    return system.num_context_frames if isinstance(system, PredictsViews) else NUM_CONTEXT
 
-    ``chamfer[part]`` has the axis step; ``motion[metric]`` has axes (object, step) and is empty without ground truth.
-    """
 
-    images: dict[str, dict[str, NDArray[np.float64]]]
-    reconstruction: dict[str, NDArray[np.float64]]
-    chamfer: dict[str, NDArray[np.float64]]
-    motion: dict[str, NDArray[np.float64]]
+def views_seen(system: PredictsVideo | PredictsViews, input_views: Sequence[int], num_views: int) -> list[int]:
+    """The views that a system looks through: ``input_views``, or all where it predicts each from its own frames."""
+    return list(range(num_views)) if isinstance(system, PredictsViews) else list(input_views)
+
+
+def without_depth(clip: Clip) -> Clip:
+    """Return a clip whose input depth is nowhere measured, for systems that predict it."""
+    return replace(clip, depth=torch.full_like(clip.depth, torch.nan))
 
 
 def check_views(clip: Clip, input_views: Sequence[int]) -> None:
@@ -93,8 +115,20 @@ def render_steps(
     return torch.cat([simulator.render([state], cameras[step]) for step, state in enumerate(states)])
 
 
-def predict_clip(simulator: PredictsVideo, clip: Clip, input_views: Sequence[int]) -> Prediction:
-    """Encode, roll out and render one clip: full images of all cameras, without gradients, one state at a time."""
+def predict_clip(system: PredictsVideo | PredictsViews, clip: Clip, input_views: Sequence[int]) -> Prediction:
+    """Predict the frames behind a clip as full images of all cameras, without gradients."""
+    if isinstance(system, PredictsViews):
+        return _predict_views(system, clip)
+    return _predict_particles(system, clip, input_views)
+
+
+def has_particles(scene: Scene) -> bool:
+    """Whether a state says where things are: a single particle carries a vector of the whole scene, and no place."""
+    return scene.current.num_particles > 1
+
+
+def _predict_particles(simulator: PredictsVideo, clip: Clip, input_views: Sequence[int]) -> Prediction:
+    """Encode, roll out and render one state at a time."""
     ticks = [_now()]
     scene = encode_clip(simulator, clip, input_views)
     ticks.append(_now())
@@ -102,58 +136,34 @@ def predict_clip(simulator: PredictsVideo, clip: Clip, input_views: Sequence[int
     ticks.append(_now())
     images = render_steps(simulator, states, clip.target_cameras).float().cpu()
     ticks.append(_now())
-    reconstruction = simulator.render([scene.current], clip.cameras[1])[0].float().cpu()
-    parts = ("encode", "rollout", "render")
-    seconds = {name: end - start for name, start, end in zip(parts, ticks[:-1], ticks[1:], strict=True)}
-    return Prediction(images, reconstruction, trajectory_of(scene.current, states), seconds)
+    reconstruction = simulator.render([scene.current], clip.cameras[-1])[0].float().cpu()
+    positions = trajectory_of(scene.current, states) if has_particles(scene) else None
+    return Prediction(images, reconstruction, None, positions, _seconds(ticks))
 
 
-def measure_clip(
-    clip: Clip,
-    prediction: Prediction,
-    protocol: Protocol,
-    mean_image: Float[Tensor, "view height width 3"],
-    constants: Float[Tensor, "step object 3"] | None,
-) -> ClipResult:
-    """Compare a prediction, and both references in its place, with the truth."""
-    target = as_float(clip.target_rgb)
-    moving = moving_pixels(clip, protocol)
-    systems = {
-        "model": prediction.images.nan_to_num(0.0),
-        "copy_last": as_float(clip.rgb[-1]).expand_as(target),
-        "train_mean": mean_image.expand_as(target),
-    }
-    images = {
-        name: _numpy(image_metrics(pred, target, moving, protocol.min_moving_pixels)) for name, pred in systems.items()
-    }
-    last_input = as_float(clip.rgb[-1:])
-    reconstruction = image_metrics(
-        prediction.reconstruction.nan_to_num(0.0)[None],
-        last_input,
-        torch.ones_like(last_input[..., 0], dtype=torch.bool),
-        protocol.min_moving_pixels,
-    )
-    distances = [
-        chamfer_to_depth(clip, step, positions, protocol.num_chamfer_points)
-        for step, positions in enumerate(prediction.positions[1:])
-    ]
-    chamfer = {
-        "mean": np.array([distance.mean for distance in distances]),
-        "accuracy": np.array([distance.accuracy for distance in distances]),
-        "completeness": np.array([distance.completeness for distance in distances]),
-    }
-    motion = {}
-    if clip.state is not None:
-        motion = _numpy(clip_motion(clip, prediction.positions, protocol.body_margin, constants)[0])
-    return ClipResult(images, {name: _numpy(reconstruction)[name] for name in ("psnr", "ssim")}, chamfer, motion)
+@torch.no_grad()
+def _predict_views(system: PredictsViews, clip: Clip) -> Prediction:
+    """Encode, roll out and decode every view by itself."""
+    ticks = [_now()]
+    slots = system.encode_views(clip.rgb)
+    ticks.append(_now())
+    following = system.rollout_views(slots, clip.target_rgb.shape[0])
+    ticks.append(_now())
+    native = system.decode(following).transpose(0, 1).float().cpu()
+    ticks.append(_now())
+    reconstruction = system.decode(slots[:, -1]).float().cpu()
+    height, width = clip.target_rgb.shape[-3:-1]
+    images, reconstruction = (resize_images(part, (height, width)) for part in (native, reconstruction))
+    return Prediction(images, reconstruction, native, None, _seconds(ticks))
 
 
 def _uint8(colors: Tensor) -> NDArray[np.uint8]:
     return (colors.nan_to_num(0.0).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
-def _numpy(values: dict[str, Tensor]) -> dict[str, NDArray[np.float64]]:
-    return {name: value.double().numpy() for name, value in values.items()}
+def _seconds(ticks: Sequence[float]) -> dict[str, float]:
+    parts = ("encode", "rollout", "render")
+    return {name: end - start for name, start, end in zip(parts, ticks[:-1], ticks[1:], strict=True)}
 
 
 def _now() -> float:

@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.errors import DataError
 from vpd_lightning.evaluation.clip import (
-    SYSTEMS,
     Prediction,
     PredictsVideo,
+    PredictsViews,
     encode_clip,
-    measure_clip,
+    has_particles,
+    num_context_frames,
     predict_clip,
+    views_seen,
+    without_depth,
 )
 from vpd_lightning.evaluation.long_rollout import LongRollout, judge_long_rollout
+from vpd_lightning.evaluation.measuring import SYSTEMS, ClipResult, measure_clip
 from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
 from vpd_lightning.evaluation.protocol import Clip, Protocol, read_clip, read_clips
 from vpd_lightning.evaluation.references import median_displacements, training_mean
@@ -31,18 +35,24 @@ Progress = Callable[[str, int, int], None]
 class Evaluation:
     """Everything measured; the first axis of every array counts clips, ``trajectory`` says whose clip each one is.
 
-    ``images[system][metric]`` is [clip, view, step], ``reconstruction[metric]`` [clip, view, 1], ``chamfer[part]``
-    [clip, step], ``motion[metric]`` [clip, object, step] (empty without ground truth). ``kept`` are the first clips
-    with their predictions, for pictures and videos.
+    ``images[system][metric]`` and ``native[metric]`` (at the system's own ``resolution``) are [clip, view, step],
+    ``reconstruction[metric]`` [clip, view, 1], ``chamfer[part]`` [clip, step], ``motion[metric]`` and
+    ``penetration[part]`` [clip, object, step]. They are empty for what the system or the recordings do not have: a
+    resolution of its own (None), particles, ground truth. ``kept`` are the first clips with their predictions, for
+    pictures and videos, ``shown_views`` the cameras to show: one that particles are seen through, and one that not.
     """
 
     clips: list[str]
     trajectory: NDArray[np.int64]
     input_views: list[int]
+    shown_views: list[int]
+    resolution: int | None
     images: dict[str, dict[str, NDArray[np.float64]]]
     reconstruction: dict[str, NDArray[np.float64]]
+    native: dict[str, NDArray[np.float64]]
     chamfer: dict[str, NDArray[np.float64]]
     motion: dict[str, NDArray[np.float64]]
+    penetration: dict[str, NDArray[np.float64]]
     long_rollouts: list[LongRollout]
     seconds: dict[str, float]
     finite: bool
@@ -53,8 +63,10 @@ class Evaluation:
         groups: dict[str, dict[str, NDArray[np.float64]]] = {
             **self.images,
             "reconstruction": self.reconstruction,
+            "native": self.native,
             "chamfer": self.chamfer,
             "motion": self.motion,
+            "penetration": self.penetration,
         }
         flat = {f"{group}/{name}": values for group, metrics in groups.items() for name, values in metrics.items()}
         return {"trajectory": self.trajectory, "clip": np.array(self.clips), **flat}
@@ -65,18 +77,22 @@ def _silent(what: str, done: int, total: int) -> None:
 
 
 def evaluate(
-    simulator: PredictsVideo,
+    system: PredictsVideo | PredictsViews,
     manifest: Manifest,
     protocol: Protocol,
     input_views: Sequence[int],
     num_kept: int = 0,
     progress: Progress = _silent,
+    *,
+    hide_depth: bool = False,
 ) -> Evaluation:
     """Evaluate on the protocol's clips. ``progress`` hears what is being done, how much of it, and of how much.
 
+    ``hide_depth`` shows the system no depth (it is not measured anywhere), for systems that predict it.
+
     Raises:
         DataError: the data set lacks the split, its recordings are too short, or they differ in shape.
-        ConfigError: the recordings lack the model's input views.
+        ConfigError: the recordings lack the model's input views, or frames before the protocol's start frames.
     """
     began = time.perf_counter()
     paths = manifest.split(protocol.split)[: protocol.num_trajectories]
@@ -84,13 +100,17 @@ def evaluate(
     train_paths = manifest.split("train")
     mean_image = training_mean(train_paths)
     constants = median_displacements(train_paths, protocol.start_frames, protocol.num_steps)
+    watch = {"references": time.perf_counter() - began, "read": 0.0, "measure": 0.0}
     num_clips = len(paths) * len(protocol.start_frames)
     names, trajectory, results, kept, timings, finite = [], [], [], [], [], True
-    for number, clip in enumerate(read_clips(paths, protocol)):
+    tick = time.perf_counter()
+    for number, clip in enumerate(read_clips(paths, protocol, num_context_frames(system))):
+        watch["read"] += time.perf_counter() - tick
         progress("clips", number, num_clips)
         if clip.rgb.shape[1:] != mean_image.shape:
             raise DataError(f"{clip.name} has images {tuple(clip.rgb.shape[1:])}, training {tuple(mean_image.shape)}.")
-        prediction = predict_clip(simulator, clip, input_views)
+        prediction = predict_clip(system, without_depth(clip) if hide_depth else clip, input_views)
+        tick = time.perf_counter()
         results.append(measure_clip(clip, prediction, protocol, mean_image, constants.get(clip.start)))
         names.append(clip.name)
         trajectory.append(clip.trajectory)
@@ -98,22 +118,42 @@ def evaluate(
         finite = finite and prediction.finite
         if number < num_kept:
             kept.append((clip, prediction))
-    long_rollouts = _roll_out_long(simulator, paths, protocol, input_views, progress)
-    seconds = {f"{name}_per_clip": float(np.mean([t[name] for t in timings])) for name in timings[0]}
-    seconds["total"] = time.perf_counter() - began
+        resolution = None if prediction.native is None else prediction.native.shape[-3]
+        watch["measure"] += time.perf_counter() - tick
+        tick = time.perf_counter()
+    long_rollouts = []
+    if isinstance(system, PredictsVideo):
+        long_rollouts = _roll_out_long(system, paths, protocol, input_views, progress, hide_depth)
+    num_views = mean_image.shape[0]
     return Evaluation(
         clips=names,
         trajectory=np.array(trajectory),
-        input_views=list(input_views),
-        images={system: _stack([result.images[system] for result in results]) for system in SYSTEMS},
-        reconstruction=_stack([result.reconstruction for result in results]),
-        chamfer=_stack([result.chamfer for result in results]),
-        motion=_stack([result.motion for result in results]),
+        input_views=views_seen(system, input_views, num_views),
+        shown_views=_shown_views(list(input_views), num_views),
+        resolution=resolution,
+        images={name: _stack([result.images[name] for result in results]) for name in SYSTEMS},
+        **_stack_all(results),
         long_rollouts=long_rollouts,
-        seconds=seconds,
+        seconds={
+            **{f"{name}_per_clip": float(np.mean([t[name] for t in timings])) for name in timings[0]},
+            **watch,
+            "total": time.perf_counter() - began,
+        },
         finite=finite,
         kept=kept,
     )
+
+
+def _shown_views(input_views: list[int], num_views: int) -> list[int]:
+    """Two cameras: the first that particles are seen through, and the first that they are not (or else the second)."""
+    known = [view for view in input_views if view < num_views]
+    others = [view for view in range(num_views) if view not in known]
+    return [*known[:1], *(others or known[1:])[:1]]
+
+
+def _stack_all(results: list[ClipResult]) -> dict[str, dict[str, NDArray[np.float64]]]:
+    groups = ("reconstruction", "native", "chamfer", "motion", "penetration")
+    return {group: _stack([getattr(result, group) for result in results]) for group in groups}
 
 
 def _stack(rows: list[dict[str, NDArray[np.float64]]]) -> dict[str, NDArray[np.float64]]:
@@ -123,9 +163,14 @@ def _stack(rows: list[dict[str, NDArray[np.float64]]]) -> dict[str, NDArray[np.f
 
 
 def _roll_out_long(
-    simulator: PredictsVideo, paths: Sequence[Path], protocol: Protocol, input_views: Sequence[int], progress: Progress
+    simulator: PredictsVideo,
+    paths: Sequence[Path],
+    protocol: Protocol,
+    input_views: Sequence[int],
+    progress: Progress,
+    hide_depth: bool,
 ) -> list[LongRollout]:
-    """Roll one clip of every trajectory with ground truth out to ``num_long_steps``."""
+    """Roll one clip of every trajectory with ground truth out to ``num_long_steps``; none without particles."""
     rollouts: list[LongRollout] = []
     if protocol.num_long_steps == 0:
         return rollouts
@@ -134,7 +179,9 @@ def _roll_out_long(
         clip = read_clip(path, number, protocol.long_start_frame, num_steps=1)
         if clip.state is None:
             continue
-        scene = encode_clip(simulator, clip, input_views)
+        scene = encode_clip(simulator, without_depth(clip) if hide_depth else clip, input_views)
+        if not has_particles(scene):
+            break
         positions = trajectory_of(scene.current, simulator.rollout(scene, protocol.num_long_steps))
         motion, bodies = clip_motion(clip, positions, protocol.body_margin, None)
         rollouts.append(judge_long_rollout(clip.name, number, positions, bodies, motion))

@@ -22,7 +22,7 @@ _SLOW_MOTION = 0.5
 def write_gallery(folder: Path, metrics: Mapping[str, Any], evaluation: Evaluation, num_videos: int) -> None:
     """Write ``curves.png``, ``contact_sheet.png`` and ``videos/*.webm`` (at half speed) into ``folder``."""
     write_curves(folder / "curves.png", step_table(metrics))
-    views = shown_views(evaluation.input_views, evaluation.images["model"]["psnr"].shape[1])
+    views = evaluation.shown_views
     if evaluation.kept:
         _write_sheet(folder / "contact_sheet.png", evaluation, views)
     if num_videos > 0:
@@ -32,12 +32,6 @@ def write_gallery(folder: Path, metrics: Mapping[str, Any], evaluation: Evaluati
         labels = [f"step {step}" for step in range(len(truth))]
         frames = comparison_frames(truth, pred, views, labels)
         write_video(folder / "videos" / f"{clip_file_name(clip)}.webm", frames, _SLOW_MOTION / clip.frame_time)
-
-
-def shown_views(input_views: list[int], num_views: int) -> list[int]:
-    """Two cameras: the first that the model sees through, and the first that it does not (or else its second)."""
-    others = [view for view in range(num_views) if view not in input_views]
-    return [*input_views[:1], *(others or input_views[1:])[:1]]
 
 
 def with_last_input(clip: Clip, prediction: Prediction) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -6,22 +6,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vpd_lightning.evaluation.bodies import Body, find_bodies, surface_errors
 from vpd_lightning.evaluation.protocol import Clip
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.geometry.workspace import inside_workspace
 from vpd_lightning.metrics.chamfer import ChamferDistance, chamfer
-from vpd_lightning.metrics.rigid_motion import (
-    centroid_error,
-    inside_box,
-    move_with_body,
-    particle_error,
-    rigidity_error,
-    rms_radius,
-)
+from vpd_lightning.metrics.rigid_motion import centroid_error, particle_error, rigidity_error, rms_radius
 from vpd_lightning.types import Particles
 
 MIN_BODY_PARTICLES = 5
-PREDICTION_METRICS = ("centroid_error", "particle_error", "rigidity_error", "size_ratio", "lowest_point")
+PREDICTION_METRICS = (
+    "centroid_error", "particle_error", "rigidity_error", "size_ratio", "lowest_point", "body_chamfer"
+)  # fmt: skip
 REFERENCE_METRICS = ("centroid_error_constant", "centroid_error_copy", "particle_error_copy")
 MOTION_METRICS = (*PREDICTION_METRICS, *REFERENCE_METRICS)
 
@@ -39,43 +35,37 @@ def trajectory_of(current: Particles, states: Sequence[Particles]) -> Float[Tens
     return torch.stack([valid_positions(state) for state in (current, *states)])
 
 
-def body_masks(clip: Clip, positions: Float[Tensor, "particle 3"], margin: float) -> Bool[Tensor, "object particle"]:
-    """Which observed particles belong to which object: those inside its true box (grown by ``margin``) at that time."""
-    assert clip.state is not None
-    poses = clip.poses(0)[0]
-    half_sizes = torch.from_numpy(clip.state.half_sizes)
-    return torch.stack(
-        [inside_box(positions, pose, half, margin) for pose, half in zip(poses, half_sizes, strict=True)]
-    )
-
-
 def body_motion(
     positions: Float[Tensor, "time particle 3"],
-    poses: Float[Tensor, "true_time 7"],
+    body: Body,
     constant: Float[Tensor, "step 3"] | None,
 ) -> dict[str, Float[Tensor, " step"]]:
-    """Judge the particles of one body (``positions``, observed first) against its true poses (observed first).
+    """Judge the particles of one body (``positions``, observed first) against its true motion.
 
-    True motion carries the same particles rigidly by the change of pose. Values are metres, but for the size ratio.
-    Steps beyond the recording have no error (NaN), only the values that need no truth; a prediction that is not finite
-    has no value at all. ``constant`` is the median displacement of the training set, the reference that knows no
-    input; "copy" predicts that nothing moves.
+    Values are metres, but for the size ratio. Steps beyond the recording have no error (NaN), only the values that need
+    no truth; a prediction that is not finite has no value at all. A soft body changes its shape, so it has no rigidity
+    error and no size ratio; ``body_chamfer`` is the mean distance of its particles to its true surface (what cameras
+    do not see of it does not count). ``constant`` is the median displacement of the training set, the reference that
+    knows no input; "copy" predicts that nothing moves.
     """
     start, pred = positions[0], positions[1:]
     finite = torch.isfinite(pred).all(-1).all(-1)
     pred = torch.where(finite[:, None, None], pred, start)
-    num_steps, num_true = pred.shape[0], min(pred.shape[0], poses.shape[0] - 1)
+    num_steps, num_true = pred.shape[0], min(pred.shape[0], body.true.shape[0] - 1)
     values = {name: torch.full((num_steps,), torch.nan, dtype=torch.float64) for name in MOTION_METRICS}
-    values["rigidity_error"] = rigidity_error(pred, start)
-    values["size_ratio"] = rms_radius(pred) / rms_radius(start)
+    if not body.is_soft:
+        values["rigidity_error"] = rigidity_error(pred, start)
+        values["size_ratio"] = rms_radius(pred) / rms_radius(start)
     values["lowest_point"] = pred[..., 2].amin(-1)
     if num_true > 0:
-        true = move_with_body(start, poses[0], poses[1 : num_true + 1])
+        true = body.true[1 : num_true + 1]
         still = start.expand_as(true)
         values["centroid_error"][:num_true] = centroid_error(pred[:num_true], true)
         values["particle_error"][:num_true] = particle_error(pred[:num_true], true)
         values["centroid_error_copy"][:num_true] = centroid_error(still, true)
         values["particle_error_copy"][:num_true] = particle_error(still, true)
+        if body.surface is not None:
+            values["body_chamfer"][:num_true] = surface_errors(pred[:num_true], body.surface[1 : num_true + 1])
         if constant is not None:
             num_known = min(num_true, constant.shape[0])
             moved = still[:num_known] + constant[:num_known, None]
@@ -91,19 +81,26 @@ def clip_motion(
     margin: float,
     constants: Float[Tensor, "step object 3"] | None,
 ) -> tuple[dict[str, Float[Tensor, "object step"]], Bool[Tensor, "object particle"]]:
-    """Judge every object of a clip; NaN for an object that the particles hardly show (fewer than 5 of them)."""
-    masks = body_masks(clip, positions[0], margin)
-    num_steps = positions.shape[0] - 1
-    poses = clip.poses(num_steps)
+    """Find the bodies of a clip and judge them; returns their motion and their particles."""
+    bodies = find_bodies(clip, positions[0], margin, positions.shape[0] - 1)
+    return bodies_motion(bodies, positions, constants), torch.stack([body.mask for body in bodies])
+
+
+def bodies_motion(
+    bodies: Sequence[Body],
+    positions: Float[Tensor, "time particle 3"],
+    constants: Float[Tensor, "step object 3"] | None,
+) -> dict[str, Float[Tensor, "object step"]]:
+    """Judge every body; NaN for one that the particles hardly show (fewer than 5 of them)."""
     rows = []
-    for index, mask in enumerate(masks):
+    for index, body in enumerate(bodies):
         constant = None if constants is None or index >= constants.shape[1] else constants[:, index]
-        if mask.sum() >= MIN_BODY_PARTICLES:
-            rows.append(body_motion(positions[:, mask], poses[:, index], constant))
+        if body.mask.sum() >= MIN_BODY_PARTICLES:
+            rows.append(body_motion(positions[:, body.mask], body, constant))
         else:
-            missing = torch.full((num_steps,), torch.nan, dtype=torch.float64)
+            missing = torch.full((positions.shape[0] - 1,), torch.nan, dtype=torch.float64)
             rows.append(dict.fromkeys(MOTION_METRICS, missing))
-    return {name: torch.stack([row[name] for row in rows]) for name in MOTION_METRICS}, masks
+    return {name: torch.stack([row[name] for row in rows]) for name in MOTION_METRICS}
 
 
 def chamfer_to_depth(clip: Clip, step: int, pred: Float[Tensor, "particle 3"], max_points: int) -> ChamferDistance:

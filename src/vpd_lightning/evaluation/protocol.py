@@ -24,11 +24,12 @@ NUM_CONTEXT = 2
 class Protocol:
     """Which clips are predicted, how far, and what the metrics count. Frames are counted from 0.
 
-    A clip that starts at frame ``s`` shows the model frames ``s`` and ``s + 1`` and asks for the ``num_steps`` frames
-    behind them. ``num_trajectories`` limits the split to its first files (None: all). ``num_long_steps`` (0: none)
-    rolls the clips of ``long_start_frame`` out further, without images. ``moving_threshold`` is a colour difference in
-    [0, 1], used where there is no segmentation; images with fewer than ``min_moving_pixels`` have no moving PSNR.
-    ``body_margin`` (metres) grows a body's true box when its particles are picked.
+    A clip that starts at frame ``s`` shows the model frames ``s`` and ``s + 1`` (to one that needs more, those before
+    them as well) and asks for the ``num_steps`` frames behind them: every model predicts the same frames.
+    ``num_trajectories`` limits the split to its first files (None: all). ``num_long_steps`` (0: none) rolls the clips
+    of ``long_start_frame`` out further, without images. ``moving_threshold`` is a colour difference in [0, 1], used
+    where there is no segmentation; images with fewer than ``min_moving_pixels`` have no moving PSNR. ``body_margin``
+    (metres) grows a body's true box, or its surface where it is soft, when its particles are picked.
     """
 
     split: str
@@ -64,9 +65,11 @@ class Protocol:
 
 @dataclass(frozen=True)
 class Clip:
-    """Two context frames and the frames to predict, all cameras; colours are uint8, depth is metres of z-depth.
+    """The frames that a model is shown and those to predict, all cameras; colours are uint8, z-depth is in metres.
 
-    ``cameras`` holds those of the context (axes ``time=2 view``), ``target_cameras`` those of the predicted frames.
+    ``cameras`` holds those of the context (axes ``time view``), ``target_cameras`` those of the predicted frames. The
+    context ends with frame ``start + 1``; it begins with frame ``start`` for a model that sees two frames, and earlier
+    for one that sees more.
     """
 
     name: str
@@ -102,8 +105,26 @@ def read_cameras(reader: TrajectoryReader, times: Sequence[int], views: Sequence
     return Cameras(_float32(intrinsics), _float32(cam_to_world), reader.height, reader.width)
 
 
-def read_clip(path: Path, trajectory: int, start: int, num_steps: int, with_state: bool = True) -> Clip:
-    """Read one clip of a trajectory; ``DataError`` where the recording is too short for it."""
+def read_clip(
+    path: Path,
+    trajectory: int,
+    start: int,
+    num_steps: int,
+    with_state: bool = True,
+    num_context: int = NUM_CONTEXT,
+) -> Clip:
+    """Read one clip of a trajectory, with the last ``num_context`` frames up to frame ``start + 1`` as its context.
+
+    Raises:
+        DataError: the recording is too short for it.
+        ConfigError: there are fewer frames before the predicted ones than the context needs.
+    """
+    first = start + NUM_CONTEXT - num_context
+    if first < 0:
+        raise ConfigError(
+            f"The model looks at {num_context} frames, but start frame {start} has only {start + NUM_CONTEXT} up to "
+            f"its last input frame.\nStart later: protocol.start_frames=[{num_context - NUM_CONTEXT}]"
+        )
     with TrajectoryReader(path) as reader:
         last = start + NUM_CONTEXT + num_steps - 1
         if last >= reader.num_frames:
@@ -113,7 +134,7 @@ def read_clip(path: Path, trajectory: int, start: int, num_steps: int, with_stat
                 "earlier."
             )
         views = range(reader.num_views)
-        context, targets = range(start, start + NUM_CONTEXT), range(start + NUM_CONTEXT, last + 1)
+        context, targets = range(first, start + NUM_CONTEXT), range(start + NUM_CONTEXT, last + 1)
         return Clip(
             name=f"{path.parent.name}/{path.name}@{start}",
             trajectory=trajectory,
@@ -131,11 +152,11 @@ def read_clip(path: Path, trajectory: int, start: int, num_steps: int, with_stat
         )
 
 
-def read_clips(paths: Sequence[Path], protocol: Protocol) -> Iterator[Clip]:
+def read_clips(paths: Sequence[Path], protocol: Protocol, num_context: int = NUM_CONTEXT) -> Iterator[Clip]:
     """Read the clips of the protocol one after the other: every start frame of the first trajectory, then the next."""
     for trajectory, path in enumerate(paths[: protocol.num_trajectories]):
         for start in protocol.start_frames:
-            yield read_clip(path, trajectory, start, protocol.num_steps)
+            yield read_clip(path, trajectory, start, protocol.num_steps, num_context=num_context)
 
 
 def _float32(array: NDArray[np.float64]) -> Tensor:

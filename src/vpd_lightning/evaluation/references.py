@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from vpd_lightning.data.ground_truth import has_state, read_state
+from vpd_lightning.data.ground_truth import read_positions
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.errors import DataError
 from vpd_lightning.evaluation.protocol import NUM_CONTEXT
@@ -49,9 +49,9 @@ def median_displacements(
     """
     displacements: dict[int, list[np.ndarray]] = {start: [] for start in start_frames}
     for path in paths:
-        if not has_state(path):
+        positions = read_positions(path)
+        if positions is None:
             continue
-        positions = read_state(path).positions
         for start in start_frames:
             current = start + NUM_CONTEXT - 1
             if len(positions) > current + num_steps:

@@ -11,26 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpd_lightning.data.schema import AtomicPath
-from vpd_lightning.evaluation.clip import SYSTEMS
 from vpd_lightning.evaluation.evaluate import Evaluation
 from vpd_lightning.evaluation.long_rollout import LongRollout
+from vpd_lightning.evaluation.measuring import SYSTEMS
 from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.evaluation.statistics import plain, pooled_psnr, summarize
 
 FORMAT_VERSION = 1
+IMAGE_METRICS = ("psnr", "psnr_moving", "ssim", "sharpness")
 
 
 def metrics_of(evaluation: Evaluation, protocol: Protocol, identity: Mapping[str, Any]) -> dict[str, Any]:
     """Build the content of ``metrics.json``; ``identity`` names the model, the checkpoint and the data.
 
     Every metric is an object with ``mean`` (over images), ``ci95`` (bootstrap over trajectories) and ``per_step``;
-    distances are metres. Values that do not exist are null.
+    distances are metres. Values that do not exist are null: a system without particles has no ``chamfer``, ``motion``,
+    ``penetration`` and ``long_rollout``, one that predicts at the resolution of the truth has no ``native``.
     """
     systems = {system: _image_summary(evaluation, protocol, system) for system in SYSTEMS}
     summary = _summarizer(evaluation, protocol)
-    chamfer = summary(evaluation.chamfer["mean"])
-    for part in ("accuracy", "completeness"):
-        chamfer[part] = summary(evaluation.chamfer[part])["mean"]
     return {
         "format_version": FORMAT_VERSION,
         **identity,
@@ -43,10 +42,12 @@ def metrics_of(evaluation: Evaluation, protocol: Protocol, identity: Mapping[str
         },
         "finite": evaluation.finite,
         **systems["model"],
-        "chamfer": chamfer,
+        "native": _native_summary(evaluation, protocol),
+        "chamfer": _parts_summary(evaluation.chamfer, summary),
         "reconstruction": {name: summary(values)["mean"] for name, values in evaluation.reconstruction.items()},
         "references": {system: systems[system] for system in SYSTEMS if system != "model"},
         "motion": _motion_summary(evaluation, protocol),
+        "penetration": _parts_summary(evaluation.penetration, summary),
         "long_rollout": _long_summary(evaluation.long_rollouts),
         "seconds": {name: plain(value) for name, value in evaluation.seconds.items()},
     }
@@ -61,13 +62,29 @@ def _image_summary(evaluation: Evaluation, protocol: Protocol, system: str) -> d
     num_views = arrays["psnr"].shape[1]
     inputs = np.isin(np.arange(num_views), evaluation.input_views)
     result = {}
-    for name in ("psnr", "ssim", "psnr_moving"):
+    for name in IMAGE_METRICS:
         result[name] = summary(arrays[name])
         result[name]["input_views"] = summary(arrays[name][:, inputs])["mean"]
         result[name]["other_views"] = summary(arrays[name][:, ~inputs])["mean"]
     result["psnr"]["pooled"] = pooled_psnr(arrays["mse"])
     result["psnr_moving"]["pooled"] = pooled_psnr(arrays["moving_mse"])
     return result
+
+
+def _native_summary(evaluation: Evaluation, protocol: Protocol) -> dict[str, Any] | None:
+    """Means at the system's own resolution, against the truth made as small."""
+    if not evaluation.native:
+        return None
+    summary = _summarizer(evaluation, protocol)
+    means = {name: summary(evaluation.native[name])["mean"] for name in IMAGE_METRICS}
+    return {"resolution": evaluation.resolution, **means}
+
+
+def _parts_summary(parts: Mapping[str, NDArray[np.float64]], summary: Any) -> dict[str, Any] | None:
+    """Summarise the part called ``mean``; of the others only the mean counts."""
+    if not parts:
+        return None
+    return {**summary(parts["mean"]), **{name: summary(parts[name])["mean"] for name in parts if name != "mean"}}
 
 
 def _motion_summary(evaluation: Evaluation, protocol: Protocol) -> dict[str, Any] | None:
@@ -161,9 +178,11 @@ def step_table(metrics: Mapping[str, Any]) -> dict[str, list[float | None]]:
     """Collect every per-step curve under a flat name; step 1 is the first predicted frame."""
     columns: dict[str, list[float | None]] = {}
     for system, values in (("model", metrics), *metrics["references"].items()):
-        for name in ("psnr", "psnr_moving", "ssim"):
+        for name in IMAGE_METRICS:
             columns[f"{system}/{name}"] = values[name]["per_step"]
-    columns["model/chamfer"] = metrics["chamfer"]["per_step"]
+    for name in ("chamfer", "penetration"):
+        if metrics[name]:
+            columns[f"model/{name}"] = metrics[name]["per_step"]
     for name, values in (metrics["motion"] or {}).items():
         columns[f"motion/{name}"] = values["per_step"]
     return {"step": [step + 1 for step in range(metrics["protocol"]["num_steps"])], **columns}

@@ -16,17 +16,30 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
         _image_line("PSNR (dB)", metrics, "psnr", 2),
         _image_line("  moving pixels (dB)", metrics, "psnr_moving", 2),
         _image_line("SSIM", metrics, "ssim", 3),
+        _image_line("sharpness (truth: 1)", metrics, "sharpness", 2, has_gain=False),
+        *_other_lines(metrics),
     ]
-    reconstruction = metrics["reconstruction"]
-    lines.append(
-        f"reconstruction of the last input frame: PSNR {_number(reconstruction['psnr'], 2)} dB, "
-        f"SSIM {_number(reconstruction['ssim'], 3)}; Chamfer {_number(_scaled(metrics['chamfer']['mean'], 100), 2)} cm"
-    )
     if metrics["motion"]:
         lines += ["", *_motion_lines(metrics["motion"], protocol["num_steps"])]
     if metrics["long_rollout"]:
         lines += ["", *_long_lines(metrics["long_rollout"])]
     return lines
+
+
+def _other_lines(metrics: Mapping[str, Any]) -> list[str]:
+    reconstruction, native = metrics["reconstruction"], metrics["native"]
+    lines = [
+        f"reconstruction of the last input frame: PSNR {_number(reconstruction['psnr'], 2)} dB, "
+        f"SSIM {_number(reconstruction['ssim'], 3)}"
+    ]
+    if native:
+        lines.append(
+            f"at its own {native['resolution']}x{native['resolution']} pixels, against the truth made as small: PSNR "
+            f"{_number(native['psnr'], 2)} dB, SSIM {_number(native['ssim'], 3)}"
+        )
+    parts = [("Chamfer", metrics["chamfer"]), ("deepest particle in floor or bodies", metrics["penetration"])]
+    known = [f"{name} {_number(_scaled(block['mean'], 100), 2)} cm" for name, block in parts if block]
+    return [*lines, "; ".join(known)] if known else lines
 
 
 def horizons(num_steps: int) -> list[int]:
@@ -39,11 +52,12 @@ def horizons(num_steps: int) -> list[int]:
     return [*chosen, num_steps] if num_steps > 1 else chosen
 
 
-def _image_line(label: str, metrics: Mapping[str, Any], name: str, digits: int) -> str:
+def _image_line(label: str, metrics: Mapping[str, Any], name: str, digits: int, *, has_gain: bool = True) -> str:
     model = metrics[name]["mean"]
     references = [metrics["references"][system][name]["mean"] for system in ("copy_last", "train_mean")]
     known = [value for value in references if value is not None]
     gain = f"{model - max(known):+8.{digits}f}" if model is not None and known else f"{'-':>8}"
+    gain = gain if has_gain else ""
     copy, mean = (_number(value, digits) for value in references)
     return f"{label:24}{_number(model, digits):>9}{copy:>11}{mean:>12}{gain}"
 
@@ -57,7 +71,10 @@ def _motion_lines(motion: Mapping[str, Any], num_steps: int) -> list[str]:
         ("  model / constant", "centroid_error_over_constant", 1.0, 2),
         ("particle error (cm)", "particle_error", 100.0, 1),
         ("block size / start", "size_ratio", 1.0, 2),
+        ("distance to surface (cm)", "body_chamfer", 100.0, 1),
     ]
+    soft_only, rigid_only = "body_chamfer", "size_ratio"
+    rows = [row for row in rows if row[1] not in (soft_only, rigid_only) or motion[row[1]]["count"]]
     lines = [f"{'after step':24}" + "".join(f"{step:>9}" for step in steps)]
     for label, name, scale, digits in rows:
         values: Sequence[float | None] = motion[name]["per_step"]

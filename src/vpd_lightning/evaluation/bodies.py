@@ -1,0 +1,97 @@
+"""Which observed particles show which true body, and where its true motion carries them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vpd_lightning.evaluation.protocol import Clip
+from vpd_lightning.metrics.rigid_motion import inside_box, move_with_body
+from vpd_lightning.metrics.surface_distance import SurfacePoints, nearest_on_surface, surface_of
+
+
+@dataclass(frozen=True)
+class Body:
+    """One true body of a clip. ``mask`` are its particles, chosen by where they are at the last input frame.
+
+    ``true`` is where its motion carries them from that frame on, as far as the recording goes: rigidly by the change of
+    pose, or for a soft body with the points of its surface that are nearest to them. ``surface`` are a soft body's
+    true triangles over the same time, None for a rigid one.
+    """
+
+    mask: Bool[Tensor, " particle"]
+    true: Float[Tensor, "true_time body_particle 3"]
+    surface: Float[Tensor, "true_time triangle 3 3"] | None
+
+    @property
+    def is_soft(self) -> bool:
+        return self.surface is not None
+
+
+def find_bodies(clip: Clip, positions: Float[Tensor, "particle 3"], margin: float, num_steps: int) -> list[Body]:
+    """Find the particles (at the last input frame) of every true body, and their true motion over ``num_steps`` steps.
+
+    A rigid body's particles lie in its true box grown by ``margin`` metres, a soft body's within ``margin`` of its true
+    surface and nearer to it than to that of another soft body.
+    """
+    assert clip.state is not None
+    poses, half_sizes = clip.poses(num_steps), torch.from_numpy(clip.state.half_sizes)
+    soft = _soft_bodies(clip, positions, margin, num_steps)
+    bodies = []
+    for number, half_size in enumerate(half_sizes):
+        if number in soft:
+            bodies.append(soft[number])
+            continue
+        pose = poses[:, number]
+        mask = inside_box(positions, pose[0], half_size, margin)
+        bodies.append(Body(mask, move_with_body(positions[mask], pose[0], pose), None))
+    return bodies
+
+
+def _soft_bodies(clip: Clip, positions: Float[Tensor, "particle 3"], margin: float, num_steps: int) -> dict[int, Body]:
+    """Return the bodies that have vertices, by the number of the object."""
+    state = clip.state
+    if state is None or state.vertices is None or state.vertex_objects is None or state.tetrahedra is None:
+        return {}
+    vertices = state.vertices[clip.current_frame : clip.current_frame + num_steps + 1].astype(np.float64)
+    triangles = surface_of(state.tetrahedra)
+    numbers = np.unique(state.vertex_objects).tolist()
+    surfaces = [vertices[:, triangles[state.vertex_objects[triangles[:, 0]] == number]] for number in numbers]
+    found = [_near_surface(positions.numpy(), surface[0], margin) for surface in surfaces]
+    distances = np.stack([distance for distance, _ in found])
+    bodies = {}
+    for row, (number, surface) in enumerate(zip(numbers, surfaces, strict=True)):
+        distance, near = found[row]
+        mask = (distance <= margin) & (distances.argmin(axis=0) == row)
+        near = near.of(mask[np.isfinite(distance)])
+        corners = surface[:, near.triangle]
+        moved = np.einsum("tpck,pc->tpk", corners - corners[:1], near.weights)
+        true = positions[torch.from_numpy(mask)] + torch.from_numpy(moved)
+        bodies[number] = Body(torch.from_numpy(mask), true, torch.from_numpy(surface))
+    return bodies
+
+
+def _near_surface(
+    points: NDArray[np.float64], corners: NDArray[np.float64], margin: float
+) -> tuple[NDArray[np.float64], SurfacePoints]:
+    """Return the distance of every point to a surface, infinite beyond its box grown by ``margin``, and what is near.
+
+    The second speaks of the points with a finite distance only.
+    """
+    low, high = corners.min(axis=(0, 1)) - margin, corners.max(axis=(0, 1)) + margin
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    near = nearest_on_surface(points[inside], corners)
+    distance = np.full(len(points), np.inf)
+    distance[inside] = near.distance
+    return distance, near
+
+
+def surface_errors(
+    pred: Float[Tensor, "step particle 3"], surface: Float[Tensor, "step triangle 3 3"]
+) -> Float[Tensor, " step"]:
+    """Mean distance in metres from each step's points to the true surface of that step."""
+    pairs = zip(pred.numpy(), surface.numpy(), strict=True)
+    return torch.tensor([nearest_on_surface(points, corners).distance.mean() for points, corners in pairs])
