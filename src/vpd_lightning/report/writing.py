@@ -1,0 +1,51 @@
+"""Write a whole report into a folder."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from vpd_lightning.data.schema import AtomicPath
+from vpd_lightning.report.board import Board, boards_of
+from vpd_lightning.report.collect import Collection
+from vpd_lightning.report.page import BoardFiles, page
+from vpd_lightning.report.plots import overview_plot, rollout_plot, settings_plot, sweep_plot
+from vpd_lightning.report.spreadsheet import write_spreadsheet
+from vpd_lightning.report.strips import write_strips
+from vpd_lightning.report.sweep import sweeps_of
+from vpd_lightning.report.warnings import board_warnings, parted_experiments
+
+
+def write_report(folder: Path, collection: Collection, title: str) -> list[str]:
+    """Write ``report.md``, ``report.csv``, plots and strips into an existing ``folder``; returns the warnings."""
+    boards = boards_of(collection.runs)
+    files = [_pictures(folder, board) for board in boards]
+    overview = folder / "rollouts.png"
+    drawn = len(boards) > 1 and overview_plot(overview, boards)
+    text = page(title, boards, files, overview if drawn else None, collection.left_out)
+    write_spreadsheet(folder / "report.csv", boards)
+    with AtomicPath(folder / "report.md") as partial:
+        partial.write_text(text, encoding="utf-8")
+    return parted_experiments(boards) + [
+        f"{board.title}: {words}" for board in boards for words in board_warnings(board)
+    ]
+
+
+def _pictures(folder: Path, board: Board) -> BoardFiles:
+    rollout = folder / f"rollout_{board.file_name}.png"
+    drawn = rollout_plot(rollout, board)
+    sweeps = []
+    for sweep in sweeps_of(board):
+        path = folder / f"sweep_{board.file_name}_{sweep.file_name}.png"
+        if sweep_plot(path, board, sweep):
+            sweeps.append((sweep, path))
+    settings = {}
+    for system in _with_settings(board):
+        path = folder / f"settings_{board.file_name}_{system}.png"
+        if settings_plot(path, board, system):
+            settings[system] = path
+    strips, not_shown = write_strips(folder, board)
+    return BoardFiles(rollout if drawn else None, settings, sweeps, strips, not_shown)
+
+
+def _with_settings(board: Board) -> Sequence[str]:
+    systems = [row.system for row in board.rows]
+    return [system for system in dict.fromkeys(systems) if systems.count(system) > 1]
