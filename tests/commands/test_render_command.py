@@ -9,6 +9,7 @@ import pytest
 
 from tests.evaluation.tossed_box import CAM_TO_WORLD, INTRINSICS, SIZE, write_tossed_boxes
 from tests.evaluation.untrained_model import write_untrained
+from tests.released_model import write_slotformer
 from vpd_lightning.commands.render import main
 
 
@@ -109,3 +110,9 @@ def test_bad_words_get_a_named_error(
     error = capsys.readouterr().err
     assert message in error and len(error.strip().splitlines()) <= 5
     assert not list(tmp_path.iterdir()), "nothing stays behind"
+
+
+def test_a_system_that_predicts_its_own_views_is_not_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_slotformer(tmp_path / "run")
+    assert main([f"ckpt={path}", "num_steps=1"]) == 2
+    assert "vpd-eval" in capsys.readouterr().err

@@ -5,14 +5,16 @@ import json
 import platform
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from vpd_lightning.commands.environment import DISTRIBUTION, devices, git_commit, requirements, version_of
 from vpd_lightning.commands.report_errors import run_command
 from vpd_lightning.errors import ConfigError, RenderingBackendError
+from vpd_lightning.export.release_folder import list_releases
 
-HELP = """vpd-info - what this installation has, and what it lacks
+HELP = """vpd-info - what this installation has, what it lacks, and the released models in ./released
 
 Usage: vpd-info [--json]
 
@@ -36,6 +38,9 @@ _EXTRAS = {
     "pyarrow": ("importing LeRobot data sets", "pip install 'vpd-lightning[lerobot]'"),
     "av": ("importing LeRobot videos", "pip install 'vpd-lightning[lerobot]'"),
 }
+RELEASED = "released"
+"""The folder, below the current one, whose models are listed."""
+
 _NEIGHBOR_BACKENDS = {
     "torch": "torch",
     "scipy": "scipy",
@@ -83,6 +88,7 @@ def collect() -> dict[str, Any]:
         },
         "blender": _blender(),
         "optional": {name: version_of(name) for name in _EXTRAS},
+        "released": list_releases(Path(RELEASED)),
         "problems": problems,
     }
 
@@ -111,8 +117,21 @@ def render(report: dict[str, Any]) -> str:
         purpose, command = _EXTRAS[name]
         lines.append(f"  {name:26}{installed or f'missing, for {purpose}: {command}'}")
     lines.append(f"  {'blender':26}{report['blender'] or 'missing, for renderer=blender: make blender'}")
+    if report["released"]:
+        lines += ["", f"released models (in ./{RELEASED}; vpd-eval ckpt=FOLDER measures one)"]
+        lines += [f"  {_released_line(entry)}" for entry in report["released"]]
     lines += ["", *(report["problems"] or ["Everything that is required is there."])]
     return "\n".join(lines)
+
+
+def _released_line(entry: Mapping[str, Any]) -> str:
+    if entry["fault"]:
+        return f"{entry['folder']:32} {entry['fault']}"
+    psnr = "" if entry.get("psnr") is None else f"  PSNR {entry['psnr']:.2f} dB"
+    return (
+        f"{entry['folder']:32} {entry['system']}, {entry['experiment']}, {entry['num_parameters']:,} parameters, "
+        f"{entry['bytes'] / 1e6:.1f} MB{psnr}"
+    )
 
 
 def _packages() -> tuple[dict[str, dict[str, str | None]], list[str]]:

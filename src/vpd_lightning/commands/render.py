@@ -34,10 +34,16 @@ def _render(config: Mapping[str, Any]) -> None:
     from vpd_lightning.evaluation import filming
     from vpd_lightning.export.output_folder import OutputFolder, beside_checkpoint, choose_folder
     from vpd_lightning.loading import load_model
+    from vpd_lightning.simulator import Simulator
 
     _check(config)
     set_threads(config["num_threads"])
     model = load_model(config["ckpt"], config["device"], config["change"], sleeping=config["sleeping"])
+    if not isinstance(model.simulator, Simulator):
+        raise ConfigError(
+            f"{model.path} predicts the videos of its own cameras and knows no others: there is nothing to film.\n"
+            "vpd-eval shows its predictions beside the truth."
+        )
     manifest = load_manifest(data_folder(config["data"]["folder"], model.config))
     path = _choose_trajectory(manifest.split(config["split"]), config)
     start, num_steps = config["start_frame"], config["num_steps"]

@@ -7,6 +7,9 @@ from pathlib import Path
 from types import TracebackType
 
 from vpd_lightning.errors import ConfigError
+from vpd_lightning.export.release_folder import WEIGHTS_FILE
+
+RUNS = "runs"
 
 
 def choose_folder(out: str | None, default: Path) -> Path:
@@ -28,9 +31,19 @@ def choose_folder(out: str | None, default: Path) -> Path:
 
 
 def beside_checkpoint(path: Path, name: str) -> Path:
-    """Return the folder ``name`` of the run that a checkpoint belongs to."""
-    parent = path.absolute().parent
-    return (parent.parent if parent.name == "checkpoints" else parent) / name
+    """Return the folder ``name`` of the run that a checkpoint belongs to.
+
+    A released model's folder stays as it is: its results go to ``runs/<its name>/`` below the current folder.
+    """
+    if path.name == WEIGHTS_FILE:
+        return Path(RUNS).absolute() / path.absolute().parent.name / name
+    return run_folder(path) / name
+
+
+def run_folder(checkpoint: Path) -> Path:
+    """Return the folder of the run that a checkpoint belongs to."""
+    parent = checkpoint.absolute().parent
+    return parent.parent if parent.name == "checkpoints" else parent
 
 
 class OutputFolder:

@@ -1,0 +1,116 @@
+"""Every model in ``released/`` is whole, small, loads, predicts, and its card tells its figures."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from tests.released_model import cameras, synthetic_frames
+from vpd_lightning.export.card_figures import REFERENCES
+from vpd_lightning.export.portable import absolute_paths
+from vpd_lightning.export.release_folder import check_release, folder_bytes, is_release
+from vpd_lightning.loading import LoadedModel, load_model
+from vpd_lightning.simulator import Simulator
+from vpd_lightning.types import Cameras, RGBDFrames
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = sorted(path for path in (ROOT / "released").glob("*") if path.is_dir())
+pytestmark = pytest.mark.skipif(not FOLDERS, reason="nothing is released")
+MAX_BYTES = 20_000_000
+STEPS = 2
+LONG = 40
+
+
+@pytest.fixture(params=FOLDERS, ids=lambda path: path.name)
+def folder(request: pytest.FixtureRequest) -> Path:
+    return request.param
+
+
+def test_it_is_whole_and_small(folder: Path) -> None:
+    assert is_release(folder)
+    index = check_release(folder)
+    assert index["name"] == folder.name and folder_bytes(folder) <= MAX_BYTES
+
+
+def test_it_names_no_place_of_a_machine(folder: Path) -> None:
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert not absolute_paths(config) and not absolute_paths(metrics)
+    assert "/home/" not in (folder / "README.md").read_text()
+
+
+def test_it_predicts(folder: Path) -> None:
+    model = load_model(folder)
+    past, views = model.simulator.num_context_frames, model.input_views
+    size = picture_size(model)
+    placed, distance = known_cameras(model, size)
+    seen = placed[:1] if isinstance(model.simulator, Simulator) else placed  # others predict the views they are given
+    rgb, depth = synthetic_frames(past, len(views), size=size, distance=distance)
+    frames = model.simulator.predict_frames(RGBDFrames(rgb, depth, over_time(placed, past)), over_time(seen, STEPS))
+    assert frames.shape == (STEPS, *seen.shape, size, size, 3)
+    assert torch.isfinite(frames).all() and frames.min() >= 0 and frames.max() <= 1
+    count = sum(parameter.numel() for parameter in model.simulator.parameters())
+    assert count == json.loads((folder / "release.json").read_text())["num_parameters"]
+
+
+def test_it_says_the_same_in_float64_and_stays_finite(folder: Path) -> None:
+    model = load_model(folder)
+    past, views = model.simulator.num_context_frames, model.input_views
+    size = picture_size(model)
+    placed, distance = known_cameras(model, size)
+    rgb, depth = synthetic_frames(past, len(views), size=size, distance=distance)
+    seen = placed[:1] if isinstance(model.simulator, Simulator) else placed
+
+    def predict(num_steps: int, dtype: torch.dtype) -> torch.Tensor:
+        system = load_model(folder).simulator.to(dtype)
+        context = RGBDFrames(rgb, depth, over_time(placed, past)).to(dtype)
+        return system.predict_frames(context, over_time(seen, num_steps).to(dtype))
+
+    # Weights are stored in float32. A neighbour more or less at the rim of a radius changes single pixels, no picture.
+    difference = predict(STEPS, torch.float32).double() - predict(STEPS, torch.float64).double()
+    assert difference.abs().mean() < 1e-3
+    assert torch.isfinite(predict(LONG, torch.float32)).all()
+
+
+def picture_size(model: LoadedModel) -> int:
+    """Height and width of the pictures a model was made for, where it is made for some."""
+    encoder = model.config.get("encoder") or {}
+    sizes = [encoder.get("height"), (encoder.get("background") or {}).get("height")]
+    return next((size for size in sizes if isinstance(size, int)), 64)
+
+
+def known_cameras(model: LoadedModel, size: int) -> tuple[Cameras, float]:
+    """Cameras for the input views that look at the workspace, and how far from its middle they are (metres).
+
+    A model that knows the background of fixed cameras gets those.
+    """
+    scene, encoder = model.config["scene"], model.config.get("encoder") or {}
+    center = [(low + high) / 2 for low, high in zip(scene["workspace_min"], scene["workspace_max"], strict=True)]
+    distance = encoder.get("initial_depth") or (scene["near"] + scene["far"]) / 2
+    placed = cameras(len(model.input_views), size=size, center=center, distance=distance)
+    background = getattr(getattr(model.simulator, "encoder", None), "background", None)
+    if background is None:
+        return placed, distance
+    poses = background.cam_to_world[model.input_views]
+    away = (poses[:, :3, 3] - torch.tensor(center)).norm(dim=-1).min()
+    return replace(placed, cam_to_world=poses), float(away)
+
+
+def over_time(placed: Cameras, num_frames: int) -> Cameras:
+    """The same cameras at every frame."""
+    index = torch.zeros(num_frames, dtype=torch.long)
+    return placed[None][index]
+
+
+def test_its_card_tells_its_figures(folder: Path) -> None:
+    metrics = json.loads((folder / "metrics.json").read_text())
+    rows = [line.split("|") for line in (folder / "README.md").read_text().splitlines() if line.startswith("| ")]
+    cells = {row[1].strip(): [cell.strip() for cell in row[2:]] for row in rows}
+    for label, name, digits in (("PSNR (dB)", "psnr", 2), ("SSIM", "ssim", 3)):
+        model, interval, *references = cells[label][:4]
+        assert model == f"{metrics[name]['mean']:.{digits}f}"
+        assert interval == " to ".join(f"{end:.{digits}f}" for end in metrics[name]["ci95"])
+        assert references == [f"{metrics['references'][of][name]['mean']:.{digits}f}" for of in REFERENCES]
