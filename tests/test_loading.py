@@ -48,6 +48,21 @@ def test_a_configuration_that_names_foreign_code_is_refused(tmp_path: Path) -> N
     assert not (tmp_path / "hacked").exists()
 
 
+@pytest.mark.parametrize("section", ["encoder", "model", "scene", "data"])
+@pytest.mark.parametrize("payload", ["${oc.create:{_target_:os.mkdir,path:FOLDER}}", "${oc.env:HOME}"])
+def test_a_configuration_with_a_reference_is_refused(tmp_path: Path, section: str, payload: str) -> None:
+    """Hydra would resolve it after the check of what may be built, to whatever it says."""
+    path = write_untrained(tmp_path / "run", tmp_path)
+    content = load_checkpoint(path)
+    values = content["hyper_parameters"][section]
+    name = next((name for name in values if name != "_target_"), "more")
+    values[name] = payload.replace("FOLDER", str(tmp_path / "hacked"))
+    write_checkpoint(content, path)
+    with pytest.raises(CheckpointError, match=f"may not be loaded.\nhyper_parameters.{section}.{name} holds a ref"):
+        load_model(path, sleeping=True)
+    assert not (tmp_path / "hacked").exists()
+
+
 def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     path = write_untrained(tmp_path / "run", tmp_path)
     content = load_checkpoint(path)

@@ -16,7 +16,7 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = ("vpd-data", "vpd-train", "vpd-eval", "vpd-render", "vpd-bench", "vpd-info")
+COMMANDS = ("vpd-data", "vpd-train", "vpd-eval", "vpd-render", "vpd-report", "vpd-export", "vpd-bench", "vpd-info")
 
 
 def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess:
