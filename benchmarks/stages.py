@@ -18,6 +18,10 @@ import vpd_lightning
 from vpd_lightning.simulator import Simulator
 
 FEATURE_DIM = 16
+ROOT = {
+    "feature_dim": FEATURE_DIM,
+    "checkpoint_dynamics": True,
+}  # keys of the root of conf/train.yaml
 USED = (
     "scene/mujoco", "scene/demo", "encoder/unet", "encoder/unet_small", "dynamics/hierarchical_gnn",
     "dynamics/hierarchical_gnn_small", "renderer/point_nerf", "renderer/point_nerf_small", "renderer/surface",
@@ -62,7 +66,7 @@ def build_simulator(
         kind: build(f"{kind}/{option}", scene, **changes)
         for kind, (option, changes) in {"encoder": encoder, "dynamics": dynamics, "renderer": renderer}.items()
     }
-    values = settings("model/vpd", scene, **model)
+    values = settings("model/vpd", scene)["model"] | model
     del values["_target_"]
     return Simulator(**stages, **values)
 
@@ -99,14 +103,14 @@ def _read(name: str) -> dict[str, Any]:
 
 
 def _filled(value: Any, scene: Mapping[str, Any]) -> Any:
-    """Resolve ``${scene.KEY}`` and ``${feature_dim}``."""
+    """Resolve ``${scene.KEY}``, and what stands at the root of conf/train.yaml."""
     if isinstance(value, Mapping):
         return {key: _filled(item, scene) for key, item in value.items()}
     if isinstance(value, list):
         return [_filled(item, scene) for item in value]
     if isinstance(value, str) and value.startswith("${"):
         key = value[2:-1]
-        return FEATURE_DIM if key == "feature_dim" else scene[key.removeprefix("scene.")]
+        return ROOT[key] if key in ROOT else scene[key.removeprefix("scene.")]
     return value
 
 

@@ -62,6 +62,8 @@ def refused(call: Callable[[], Any], name: str) -> None:
 @pytest.mark.parametrize("option", options("renderer"))
 @pytest.mark.parametrize("name", ["positions", "features"])
 def test_renderers_refuse_bad_particles(option: str, name: str, bad: float, request: pytest.FixtureRequest):
+    if option.startswith("global_nerf") and name == "positions":
+        pytest.skip("not read")
     known_fault(request, "features_unchecked" if name == "features" else "positions_unnamed")
     renderer, (_, particles) = stage("renderer", option, FLOAT64, CPU), ball_particles()
     broken = replace(particles, **{name: with_one(getattr(particles, name), bad)})
@@ -109,6 +111,8 @@ def stepped(dynamics: Any, previous: Particles, current: Particles) -> Particles
 @pytest.mark.parametrize("when", ["previous", "current"])
 def test_dynamics_refuses_bad_particles(option: str, when: str, name: str, bad: float, request: pytest.FixtureRequest):
     if option.startswith("inertial") and (when, name) == ("previous", "features"):
+        pytest.skip("not read")
+    if option.startswith("global_mlp") and name == "positions":
         pytest.skip("not read")
     if option.startswith("inertial"):
         known_fault(request, "inertial_unchecked")

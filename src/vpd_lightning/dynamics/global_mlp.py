@@ -10,7 +10,7 @@ from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.blocks import MLP
 from vpd_lightning.graph.pooling import mean_features
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Particles, require_finite
 
 
 class GlobalMLPDynamics(AbstractDynamics):
@@ -37,7 +37,10 @@ class GlobalMLPDynamics(AbstractDynamics):
         self, previous: Particles, current: Particles, memory: Any, keys: RandomKeys, rollout_step: int
     ) -> tuple[Particles, Any]:
         """Return the particles of the next step, their features of unit length; there is no memory."""
+        previous, current = previous.without_padding(), current.without_padding()
+        require_finite(
+            "Dynamics", **{"features of both frames": torch.cat([previous.features, current.features], dim=-2)}
+        )
         change = self.network(torch.cat([mean_features(previous), mean_features(current)], dim=-1))
-        current = current.without_padding()
         features = current.features + change[..., None, :].to(current.features.dtype)
         return replace(current, features=nn.functional.normalize(features, dim=-1)), memory
