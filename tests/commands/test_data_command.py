@@ -56,7 +56,7 @@ def test_validate_lists_faults_and_fails(tmp_path: Path, capsys: pytest.CaptureF
         (["generate", *TINY, "out={out}", "seed=x"], 2, "seed is 'x'"),
         (["generate", *TINY, "out={out}", "seed=-1"], 2, "seed is -1"),
         (["generate", *TINY[2:], "scene=moon", "preset=tiny", "out={out}"], 2, "Available: deformable_block"),
-        (["generate", "scene=mujoco_block", "preset=big", "out={out}"], 2, "Available: demo, paper, tiny"),
+        (["generate", "scene=mujoco_block", "preset=big", "out={out}"], 2, "Available: demo, paper, small, tiny"),
         (["generate", *TINY, "out={out}", "split.test=1"], 2, "did you mean 'splits.test'"),
         (["generate", *TINY, "out={out}", "splits.test=two"], 2, "splits.test"),
         (["generate", *TINY, "out={out}", "splits.test=[1"], 2, "cannot be read"),

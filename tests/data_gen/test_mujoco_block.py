@@ -137,8 +137,8 @@ def test_paper_preset_has_the_papers_numbers():
     assert (settings.workspace_min, settings.workspace_max) == ([-1.0] * 3, [1.0] * 3)
 
 
-def test_there_are_three_presets():
-    assert preset_names("mujoco_block") == ["demo", "paper", "tiny"]
+def test_there_are_four_presets():
+    assert preset_names("mujoco_block") == ["demo", "paper", "small", "tiny"]
 
 
 def test_tiny_preset_is_the_demos_with_fewer_and_shorter_trajectories():

@@ -26,7 +26,7 @@ def test_full_size_trajectory_is_valid(scene: str, tmp_path: Path):
     assert trajectory.rgb.shape == (96, 9, 128, 128, 3)
     assert (trajectory.depth > 0).all()
     assert state["positions"].shape == (96, 3, 3)
-    assert all(np.isfinite(state[name]).all() for name in state)
+    assert all(np.isfinite(values).all() for values in state.values() if values is not None)  # no soft bodies
     assert set(np.unique(state["segmentation"])) == {0, 1, 2, 3}  # every object is seen
     if scene.endswith("high"):
         assert trajectory.depth.max() < trajectory.far  # no dome
