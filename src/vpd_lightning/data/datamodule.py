@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as pl
 import numpy as np
@@ -170,7 +171,7 @@ class VideoDataModule(pl.LightningDataModule):
 
     def loader(
         self, max_steps: int, first_step: Callable[[], int] = lambda: 0, rank: int = 0, world_size: int = 1
-    ) -> DataLoader[VideoBatch]:
+    ) -> DataLoader[Any]:
         """Return a loader of this rank's share of each step's batch (works without a trainer)."""
         return StepLoader(
             self.clip_dataset(max_steps),
@@ -181,10 +182,14 @@ class VideoDataModule(pl.LightningDataModule):
                 world_size=world_size,
                 first_step=first_step,
             ),
-            collate_fn=collate_clips,
+            collate_fn=self._collate(),
             num_workers=self.num_workers,
             worker_init_fn=one_thread,
         )
+
+    def _collate(self) -> Callable[[Sequence[Any]], Any]:
+        """Say how samples become a batch; loader workers get a copy of it."""
+        return collate_clips
 
     def val_dataloader(self) -> DataLoader[VideoClip] | list[DataLoader[VideoClip]]:
         """Return this rank's validation clips, one at a time."""

@@ -1,21 +1,18 @@
 """The data of systems that know single camera views only: clips of them, and the slots they are stored as."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lightning.pytorch.utilities import rank_zero_only
-from torch.utils.data import DataLoader
 
-from vpd_lightning.data.datamodule import VideoDataModule, one_thread
+from vpd_lightning.data.datamodule import VideoDataModule
 from vpd_lightning.data.manifest import file_sha256, load_manifest
-from vpd_lightning.data.sampler import StepBatchSampler, StepLoader
 from vpd_lightning.data.slot_extraction import encoder_of, extract_slots, wait_for_slots
 from vpd_lightning.data.slot_store import INDEX_FILE, SlotSource, SlotStore
 from vpd_lightning.data.view_clips import ViewClipDataset, collate_views
 from vpd_lightning.errors import ConfigError
-from vpd_lightning.types import ViewBatch
 
 FOLDER = "slots"  # in the run folder
 
@@ -112,23 +109,8 @@ class ViewDataModule(VideoDataModule):
             slots=self.slots,
         )
 
-    def loader(
-        self, max_steps: int, first_step: Callable[[], int] = lambda: 0, rank: int = 0, world_size: int = 1
-    ) -> DataLoader[ViewBatch]:
-        """Return a loader of this rank's share of each step's batch (works without a trainer)."""
-        return StepLoader(
-            self.clip_dataset(max_steps),
-            batch_sampler=StepBatchSampler(
-                batch_size=self.batch_size,
-                max_steps=max_steps,
-                rank=rank,
-                world_size=world_size,
-                first_step=first_step,
-            ),
-            collate_fn=partial(collate_views, num_history=self.num_context_frames),
-            num_workers=self.num_workers,
-            worker_init_fn=one_thread,
-        )
+    def _collate(self) -> Callable[[Sequence[Any]], Any]:
+        return partial(collate_views, num_history=self.num_context_frames)
 
 
 _NO_SLOTS = (
