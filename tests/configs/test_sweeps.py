@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from vpd_lightning.commands.sweeps import sweep_jobs
-from vpd_lightning.config import check_targets, check_widths, config_folder, expand_sweep
+from vpd_lightning.config import check_targets, check_widths, compose, config_folder, expand_sweep
 from vpd_lightning.config.run_folders import sweep_folder, sweep_slug
 
 SWEEPS = sorted(path.stem for path in (config_folder() / "sweep").glob("*.yaml"))
@@ -29,22 +29,49 @@ def test_sweep_has_as_many_jobs_as_the_paper_compares(sweep: str):
     assert len({tuple(job) for job in jobs}) == len(jobs)
 
 
+def jobs_that_show_every_word(sweep: str, budget: str) -> list[list[str]]:
+    """Choose jobs so that each word of the sweep is in one of them: all 28 of table2 would take long to compose."""
+    seen: set[str] = set()
+    chosen = []
+    for words in expand_sweep("train", [f"sweep={sweep}", f"budget={budget}"]):
+        if not seen.issuperset(words):
+            chosen.append(words)
+        seen.update(words)
+    return chosen
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("budget", ["paper", "minutes"])
 @pytest.mark.parametrize("sweep", SWEEPS)
-def test_every_job_composes_fits_its_classes_and_has_a_place_of_its_own(sweep: str, budget: str):
-    jobs = sweep_jobs([f"sweep={sweep}", f"budget={budget}"], None)
+def test_every_word_of_a_sweep_composes_and_fits_its_classes(sweep: str, budget: str):
+    configs = [compose("train", [*words, "run.folder=chosen"]) for words in jobs_that_show_every_word(sweep, budget)]
 
-    assert len({job.folder for job in jobs}) == len(jobs)
-    for job in jobs:
-        assert job.sweep_folder == Path.cwd() / "runs" / "sweeps" / sweep
-        assert job.folder.parent == job.sweep_folder / job.config["experiment"]
-        assert job.config["evaluate"]
+    for config in configs:
+        assert config["evaluate"] and config["sweep_name"] == sweep
         for section in SECTIONS:
-            check_targets(job.config[section], section)
-        check_widths(job.config)
-    different = {str({key: value for key, value in job.config.items() if key not in ("run", "system")}) for job in jobs}
-    assert len(different) == len(jobs)  # no budget takes away what a sweep is about
+            check_targets(config[section], section)
+        check_widths(config)
+    different = {
+        str({key: value for key, value in config.items() if key not in ("run", "system")}) for config in configs
+    }
+    assert len(different) == len(configs)  # no budget takes away what a sweep is about
+
+
+@pytest.mark.parametrize("sweep", SWEEPS)
+def test_every_job_of_a_sweep_has_a_place_of_its_own(sweep: str):
+    jobs = expand_sweep("train", [f"sweep={sweep}"])
+    parameters = sorted({word.partition("=")[0] for words in jobs for word in words} - {"experiment"})
+
+    places = {(*(word for word in words if "experiment=" in word), sweep_slug(words, parameters)) for words in jobs}
+
+    assert len(places) == len(jobs)
+
+
+def test_job_knows_the_folder_of_its_sweep_and_its_own_inside():
+    (job,) = sweep_jobs(["sweep=table2", "experiment=movi_a", "model=vpd", "budget=minutes"], None)
+
+    assert job.sweep_folder == Path.cwd() / "runs" / "sweeps" / "table2"
+    assert job.folder == job.sweep_folder / "movi_a" / "model-vpd__budget-minutes"
 
 
 def test_command_line_narrows_a_sweep_and_adds_to_it():

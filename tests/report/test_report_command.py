@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tests.report.made_runs import write_rollouts, write_run
 from vpd_lightning.commands.report import main
@@ -42,7 +43,7 @@ def test_the_report_prints_what_the_evaluations_say(runs: Path):
     assert "PSNR (dB): vpd" in text and "no other system's interval reaches its own" in text
     pictures = re.findall(r"\]\((.*?)\)", text)
     assert len(pictures) >= 6 and all((out / name).stat().st_size > 1000 for name in pictures)
-    assert {path.name for path in out.glob("*.png")} == set(pictures)
+    assert {path.name for path in out.iterdir() if path.suffix in (".png", ".webm")} == set(pictures)
     assert not list(runs.glob(".report*"))
 
 
@@ -68,6 +69,27 @@ def test_strips_show_the_same_rollout_of_every_system(runs: Path):
     assert both.shape[0] - one.shape[0] == 2 * (96 + 2) and both.shape[1] == one.shape[1]
     # 100 is the shade that vpd predicted, in two rows of four images of 96 x 96 pixels with 3 colours.
     assert int((both == 100).sum()) >= 2 * 4 * 96 * 96 * 3 > 10 * int((one == 100).sum())
+
+
+def test_films_show_every_system_beside_the_truth_for_all_steps(runs: Path):
+    names = sorted(path.name for path in (runs / "report").glob("film_*"))
+    assert names == [f"film_mujoco_block_test_{number}_start4.webm" for number in ("000000", "000007")]
+    assert all(f"({name})" in (runs / "report/report.md").read_text() for name in names)
+    both, one = (film_frames(runs / "report" / name) for name in names)
+    # Panels of 128 pixels in a frame of one: truth, slotformer and vpd, against truth and slotformer.
+    assert both.shape[2] - one.shape[2] == 128 + 2 and both.shape[1] == one.shape[1] == 2 * (22 + 22 + 128 + 2)
+    assert len(both) == len(one) == 4
+    vpd = both[:, 60:150, -120:-10].astype(int)
+    assert abs(vpd - 100).max() <= 8  # 100 is the shade that vpd predicted, and compression loses little of it
+
+
+def film_frames(path: Path) -> NDArray[np.uint8]:
+    """Read a film's frames (time, height, width, 3)."""
+    film = cv2.VideoCapture(str(path))
+    frames = []
+    while (read := film.read())[0]:
+        frames.append(read[1])
+    return np.stack(frames)
 
 
 def test_strip_steps_reach_from_the_first_to_the_last():

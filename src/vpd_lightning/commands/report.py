@@ -8,7 +8,7 @@ from pathlib import Path
 from vpd_lightning.commands.report_errors import run_command
 from vpd_lightning.errors import ConfigError
 
-HELP = """vpd-report: tables, plots and strips of rollouts over evaluated runs
+HELP = """vpd-report: tables, plots, strips and films of rollouts over evaluated runs
 
   vpd-report FOLDER... [out=FOLDER] [title=TEXT] [split=test]
       Finds all run folders below FOLDER... that vpd-eval has evaluated, brings together what can be compared (same
@@ -17,7 +17,7 @@ HELP = """vpd-report: tables, plots and strips of rollouts over evaluated runs
                             warnings about what the rows of a table do not share
         report.csv          one row per run: all means, intervals and settings
         rollout*.png        scores over the predicted step; sweep*.png, settings*.png: over what was swept
-        strips_*.png        the same rollouts as every system predicted them
+        strips_*.png        the same rollouts as every system predicted them; film_*.webm: the same, moving
       out       a folder that does not exist; default: FOLDER/report, or runs/report/<time> for several folders
       title     the heading of report.md
       split     of which split the evaluations count: test, or validation while tuning

@@ -42,6 +42,7 @@ class BoardFiles:
     settings: Mapping[str, Path]
     sweeps: Sequence[tuple[Sweep, Path]]
     strips: Sequence[Path]
+    films: Sequence[Path]
     not_shown: Sequence[tuple[Path, str]]
 
 
@@ -124,6 +125,7 @@ def _board(board: Board, files: BoardFiles) -> list[str]:
             "### Rollouts",
             "",
             *(_picture(path.stem.replace("_", " "), path) + "\n" for path in files.strips),
+            *(f"- [{path.stem.replace('_', ' ')}]({path.name})" for path in files.films),
         ]
     lines += [f"- not shown: `{path}` ({why})" for path, why in files.not_shown]
     return [*lines, ""]

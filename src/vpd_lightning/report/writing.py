@@ -6,6 +6,8 @@ from pathlib import Path
 from vpd_lightning.data.schema import AtomicPath
 from vpd_lightning.report.board import Board, boards_of
 from vpd_lightning.report.collect import Collection
+from vpd_lightning.report.films import write_films
+from vpd_lightning.report.kept_rollouts import kept_rollouts
 from vpd_lightning.report.page import BoardFiles, page
 from vpd_lightning.report.plots import overview_plot, rollout_plot, settings_plot, sweep_plot
 from vpd_lightning.report.spreadsheet import write_spreadsheet
@@ -15,7 +17,7 @@ from vpd_lightning.report.warnings import board_warnings, parted_experiments
 
 
 def write_report(folder: Path, collection: Collection, title: str) -> list[str]:
-    """Write ``report.md``, ``report.csv``, plots and strips into an existing ``folder``; returns the warnings."""
+    """Write ``report.md``, ``report.csv``, plots, strips, films into an existing ``folder``; returns the warnings."""
     boards = boards_of(collection.runs)
     files = [_pictures(folder, board) for board in boards]
     overview = folder / "rollouts.png"
@@ -42,8 +44,9 @@ def _pictures(folder: Path, board: Board) -> BoardFiles:
         path = folder / f"settings_{board.file_name}_{system}.png"
         if settings_plot(path, board, system):
             settings[system] = path
-    strips, not_shown = write_strips(folder, board)
-    return BoardFiles(rollout if drawn else None, settings, sweeps, strips, not_shown)
+    kept = kept_rollouts(board)
+    strips, films = write_strips(folder, board, kept), write_films(folder, board, kept)
+    return BoardFiles(rollout if drawn else None, settings, sweeps, strips, films, kept.skipped)
 
 
 def _with_settings(board: Board) -> Sequence[str]:
