@@ -1,6 +1,8 @@
 """Trainings in two parts: what the first one says and does, and what reaches the second."""
 
+import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from vpd_lightning.config.pretraining import FOLDER
 from vpd_lightning.errors import CheckpointError
 from vpd_lightning.loading import load
 from vpd_lightning.training.checkpoint_io import load_checkpoint, write_checkpoint
+from vpd_lightning.training.module import VPDModule
 
 WORDS = ["experiment=mujoco_block", "model=sequential", "budget=tiny", "num_threads=1", "logger=none"]
 SHORT = ["trainer.max_steps=4", "pretraining.settings.trainer.max_steps=3", "trainer.val_check_interval=100"]
@@ -100,6 +103,36 @@ def test_run_that_ended_between_the_two_trainings_goes_on(data: Path, tmp_path: 
     assert main([f"resume={run}"]) == 0
     found = load_checkpoint(run / "checkpoints" / "last.ckpt")["state_dict"]
     assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+@pytest.mark.slow
+def test_run_killed_in_its_first_training_goes_on_there_and_is_evaluated(data: Path, tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert train(data, whole) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(VPDModule, "on_train_batch_start", dies_at_step(2), raising=False)
+        with pytest.raises(RuntimeError, match="killed"):
+            train(data, killed, "callbacks.keep_checkpoints.every_n_steps=1", "evaluate=true")
+    assert not (killed / FOLDER / DONE_FILE).exists() and not (killed / "checkpoints").exists()
+
+    assert main([f"resume={killed}"]) == 0
+
+    expected, found = (load_checkpoint(run / "checkpoints" / "last.ckpt") for run in (whole, killed))
+    assert found["global_step"] == expected["global_step"] == 4
+    assert all(torch.equal(found["state_dict"][name], value) for name, value in expected["state_dict"].items())
+    figures = json.loads((killed / "evaluation" / "metrics.json").read_text())
+    last = (killed / "checkpoints" / "last.ckpt").read_bytes()
+    assert figures["checkpoint_sha256"] == hashlib.sha256(last).hexdigest()
+
+
+def dies_at_step(step: int) -> Callable[..., None]:
+    """Stand for a kill between two updates: what the last checkpoint does not hold is lost."""
+
+    def die(module: VPDModule, batch: Any, batch_index: int) -> None:
+        if module.global_step >= step:
+            raise RuntimeError("killed")
+
+    return die
 
 
 def test_weights_without_a_place_are_refused(tmp_path: Path) -> None:
