@@ -88,6 +88,17 @@ def test_differing_budgets_and_seeds_are_told(make_run: MakeRun, tmp_path: Path)
     assert "global 1, vpd 2" in words
 
 
+def test_training_on_other_data_than_the_evaluation_is_told(make_run: MakeRun, tmp_path: Path):
+    same, other = make_run("same"), make_run("other", system="global")
+    for run, digest in ((same, "a" * 64), (other, "b" * 64)):
+        path = run / "evaluation" / "metrics.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "training": {"data_sha256": digest}}))
+
+    (words,) = [words for words in board_warnings(boards(tmp_path)[0]) if "trained on another data set" in words]
+
+    assert "bbbbbbbbbbbb" in words and str(same) not in words
+
+
 def test_same_budgets_warn_of_nothing(make_run: MakeRun, tmp_path: Path):
     make_run("a")
     make_run("b", system="global")

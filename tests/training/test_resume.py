@@ -12,8 +12,10 @@ import torch
 
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import SignalAt, tiny_data, tiny_module, tiny_trainer
+from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.training.checkpoint_io import load_checkpoint
 from vpd_lightning.training.checkpoints import find_resume
+from vpd_lightning.training.module import DATA_SHA256
 
 STEPS = 30
 TIMED = "rays_per_second"
@@ -107,6 +109,21 @@ def test_a_run_that_is_finished_stays_as_it_is(data: Path, uninterrupted: Path) 
     before = {path: path.read_bytes() for path in uninterrupted.rglob("*") if path.is_file()}
     resume(data, uninterrupted)
     assert {path: path.read_bytes() for path in uninterrupted.rglob("*") if path.is_file()} == before
+
+
+def test_a_checkpoint_names_its_data_and_going_on_with_other_data_warns(
+    data: Path, uninterrupted: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    last = uninterrupted / "checkpoints" / "last.ckpt"
+    assert load_checkpoint(last)[DATA_SHA256] == load_manifest(data).digest
+    tiny_trainer(tmp_path / "same", STEPS + 1).fit(tiny_module(), tiny_data(data), ckpt_path=last)
+    assert "not what this training began with" not in caplog.text
+
+    other = write_recordings(tmp_path / "data", num_train=3)
+    tiny_trainer(tmp_path / "other", STEPS + 1).fit(tiny_module(), tiny_data(other), ckpt_path=last)
+
+    assert "not what this training began with" in caplog.text
+    assert load_checkpoint(tmp_path / "other/checkpoints/last.ckpt")[DATA_SHA256] == load_manifest(other).digest
 
 
 def test_with_workers_or_another_start_nothing_changes(data: Path, uninterrupted: Path, tmp_path: Path) -> None:

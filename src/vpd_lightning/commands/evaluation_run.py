@@ -23,6 +23,7 @@ from vpd_lightning.export.output_folder import OutputFolder, beside_checkpoint, 
 from vpd_lightning.export.release_folder import is_release
 from vpd_lightning.loading import LoadedModel, load_model
 from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.module import DATA_SHA256
 
 _DEFAULT_SYSTEM = "vpd"  # checkpoints from before there were others do not say
 
@@ -101,8 +102,8 @@ def _write_config(path: Path, config: Mapping[str, Any]) -> None:
 def training_of(content: Mapping[str, Any], checkpoint: Path) -> dict[str, Any]:
     """Describe the training behind a checkpoint: as ``training_time.json``, but of these weights; null: not known.
 
-    ``seconds`` includes ``seconds_before`` (of a first training and what it prepared). Nothing in a checkpoint says
-    yet which bytes of data it was trained on.
+    ``seconds`` includes ``seconds_before`` (of a first training and what it prepared); ``data_sha256`` is the digest
+    of the data set that was trained on.
     """
     state = (content.get("callbacks") or {}).get("TimeBudget") or {}
     budget = ((content.get("hyper_parameters") or {}).get("callbacks") or {}).get("time_budget") or {}
@@ -114,7 +115,7 @@ def training_of(content: Mapping[str, Any], checkpoint: Path) -> dict[str, Any]:
         "clock": budget.get("clock"),
         "steps": state.get("steps", content.get("global_step")),
         "checkpoint_name": checkpoint.name,
-        "data_sha256": None,
+        "data_sha256": content.get(DATA_SHA256),
     }
 
 

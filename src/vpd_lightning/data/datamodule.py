@@ -77,6 +77,7 @@ class VideoDataModule(pl.LightningDataModule):
         self.num_validation_clips, self.num_validation_steps = num_validation_clips, num_validation_steps
         self.validation_views, self.load_future = validation_views, load_future
         self.num_context_frames = NUM_CONTEXT_FRAMES
+        self.data_sha256: str | None = None  # of the data set; known from setup on
         self.trajectories: list[TrajectoryFrames] = []
         self.validation: ValidationClips | None = None
         self._medians: dict[int, tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]] = {}
@@ -86,6 +87,7 @@ class VideoDataModule(pl.LightningDataModule):
         if self.trajectories:
             return
         manifest = load_manifest(self.folder)
+        self.data_sha256 = manifest.digest
         files = manifest.split("train")
         wanted = len(files) if self.num_trajectories is None else self.num_trajectories
         if not 1 <= wanted <= len(files):

@@ -54,6 +54,7 @@ def board_warnings(board: Board) -> list[str]:
     )
     if len({tuple(run.metrics["protocol"].get("input_views") or ()) for row in rows for run in row.runs}) > 1:
         found.append(f"the systems do not look through the same cameras; input views: {views}.")
+    found += _other_data(board)
     broken = [str(run.folder) for run in board.runs if run.metrics.get("finite") is False]
     if broken:
         found.append(
@@ -66,6 +67,13 @@ def board_warnings(board: Board) -> list[str]:
     if not _same_references(board):
         found.append("the scores of the references differ between its runs, though data and protocol are the same.")
     return found
+
+
+def _other_data(board: Board) -> list[str]:
+    """Say which runs are known to have been trained on another data set than the one they were evaluated on."""
+    trained = [(run, (run.metrics.get("training") or {}).get("data_sha256")) for run in board.runs]
+    other = [f"{run.folder} (`{digest[:12]}`)" for run, digest in trained if digest not in (None, board.data_sha256)]
+    return [f"these were trained on another data set than they are evaluated on: {', '.join(other)}."] if other else []
 
 
 def _by_row(rows: Sequence[Row], pick: object) -> str:

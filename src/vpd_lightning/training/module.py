@@ -1,5 +1,6 @@
 """The training of a simulator as a LightningModule: which parts are called when, and what is logged. No maths."""
 
+import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -17,6 +18,10 @@ from vpd_lightning.training.optimization import AbstractOptimization
 from vpd_lightning.types import VideoBatch, ViewBatch
 
 BEST_METRIC = "validation/psnr"
+DATA_SHA256 = "data_sha256"
+"""Where a checkpoint keeps the digest of the data set it was trained on."""
+
+log = logging.getLogger(__name__)
 
 
 class VPDModule(pl.LightningModule):
@@ -63,6 +68,22 @@ class VPDModule(pl.LightningModule):
         expected = self.expected_steps or (lambda: self.trainer.max_steps)
         optimizer, schedule = self.optimization.build(self.simulator, expected)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    # -- what a checkpoint says of its data ----------------------------------------------------------------------------
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep the digest of the data set that was trained on."""
+        checkpoint[DATA_SHA256] = self._data_sha256()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Warn where a training goes on with other data than before."""
+        before, now = checkpoint.get(DATA_SHA256), self._data_sha256()
+        if before and now and before != now:
+            log.warning("the data set is not what this training began with (SHA-256 %s, was %s)", now[:12], before[:12])
+
+    def _data_sha256(self) -> str | None:
+        trainer = self._trainer  # absent where a checkpoint is read without one
+        return getattr(getattr(trainer, "datamodule", None), "data_sha256", None)
 
     # -- training ------------------------------------------------------------------------------------------------------
 
