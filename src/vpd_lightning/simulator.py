@@ -50,13 +50,17 @@ class Simulator(AbstractSystem):
         self.location_noise, self.checkpoint_dynamics = location_noise, checkpoint_dynamics
 
     def forward(self, batch: VideoBatch) -> SimulatorOutput:
-        """Predict the rays of every step of the batch; all steps are rendered in one call."""
+        """Predict the rays of every step of the batch; all steps are rendered in one call.
+
+        ``auxiliary`` is what the encoder offers of the current frame, and of the one before as ``previous_NAME``.
+        """
         previous = self.encoder(batch.context[:, 0], batch.keys, "previous")
         current = self.encoder(batch.context[:, 1], batch.keys, "current")
         num_steps = batch.rays.origins.shape[1]
         states = self.unroll(previous.particles, current.particles, num_steps, batch.keys)
         rendered = self._render_steps(states, batch.rays, batch.keys if self.training else None)
-        return SimulatorOutput(rendered, states, current.auxiliary)
+        before = {f"previous_{name}": value for name, value in previous.auxiliary.items()}
+        return SimulatorOutput(rendered, states, current.auxiliary | before)
 
     def unroll(self, previous: Particles, current: Particles, num_steps: int, keys: RandomKeys) -> list[Particles]:
         """Apply the dynamics ``num_steps`` times; returns the predicted states, the first one a step after current."""
