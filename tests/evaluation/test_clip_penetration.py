@@ -97,7 +97,7 @@ def test_particles_in_another_bodys_true_box_are_measured_to_its_nearest_face(cl
 def test_what_two_boxes_share_from_the_start_is_no_penetration(clip: Clip) -> None:
     clip = two_boxes(clip)
     start = particles_of(clip, 0)
-    shared = Body(torch.ones(10, dtype=torch.bool), start.expand(5, -1, -1), None)
+    shared = Body(torch.ones(10, dtype=torch.bool), start.expand(5, -1, -1), None, start)
     depths = clip_penetration(clip, [shared, shared], start.expand(5, -1, -1), 5)
     assert (depths["bodies"] == 0).all()
 

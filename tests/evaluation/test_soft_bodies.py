@@ -52,10 +52,10 @@ def test_particles_of_a_soft_body_are_those_at_its_surface(scene: SoftScene, cli
 def test_a_perfect_prediction_of_a_soft_body_has_no_error(scene: SoftScene, clip: Clip) -> None:
     motion, masks = clip_motion(clip, prediction(scene)[: 1 + 5], MARGIN, None)
     assert masks[1].sum() == scene.surface.shape[1]
-    for name in ("centroid_error", "particle_error", "body_chamfer"):
+    for name in ("centroid_error", "particle_error", "body_chamfer", "height_error", "velocity_error"):
         assert motion[name][1].max() < 1e-6, name  # vertices are stored in float32
     assert motion["centroid_error_copy"][1, -1] > 0.1
-    for name in ("rigidity_error", "size_ratio"):
+    for name in ("rigidity_error", "size_ratio", "orientation_error"):
         assert motion[name][1].isnan().all(), f"{name} says nothing of a body that changes its shape"
 
 

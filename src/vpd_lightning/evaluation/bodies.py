@@ -19,12 +19,14 @@ class Body:
 
     ``true`` is where its motion carries them from that frame on, as far as the recording goes: rigidly by the change of
     pose, or for a soft body with the points of its surface that are nearest to them. ``surface`` are a soft body's
-    true triangles over the same time, None for a rigid one.
+    true triangles over the same time, None for a rigid one. ``before`` is where they were one frame earlier, at the
+    first input frame.
     """
 
     mask: Bool[Tensor, " particle"]
     true: Float[Tensor, "true_time body_particle 3"]
     surface: Float[Tensor, "true_time triangle 3 3"] | None
+    before: Float[Tensor, "body_particle 3"]
 
     @property
     def is_soft(self) -> bool:
@@ -38,7 +40,7 @@ def find_bodies(clip: Clip, positions: Float[Tensor, "particle 3"], margin: floa
     surface and nearer to it than to that of another soft body.
     """
     assert clip.state is not None
-    poses, half_sizes = clip.poses(num_steps), torch.from_numpy(clip.state.half_sizes)
+    poses, previous, half_sizes = clip.poses(num_steps), clip.previous_pose(), torch.from_numpy(clip.state.half_sizes)
     soft = _soft_bodies(clip, positions, margin, num_steps)
     bodies = []
     for number, half_size in enumerate(half_sizes):
@@ -47,7 +49,8 @@ def find_bodies(clip: Clip, positions: Float[Tensor, "particle 3"], margin: floa
             continue
         pose = poses[:, number]
         mask = inside_box(positions, pose[0], half_size, margin)
-        bodies.append(Body(mask, move_with_body(positions[mask], pose[0], pose), None))
+        true = move_with_body(positions[mask], pose[0], pose)
+        bodies.append(Body(mask, true, None, move_with_body(positions[mask], pose[0], previous[number][None])[0]))
     return bodies
 
 
@@ -56,11 +59,12 @@ def _soft_bodies(clip: Clip, positions: Float[Tensor, "particle 3"], margin: flo
     state = clip.state
     if state is None or state.vertices is None or state.vertex_objects is None or state.tetrahedra is None:
         return {}
-    vertices = state.vertices[clip.current_frame : clip.current_frame + num_steps + 1].astype(np.float64)
+    # The frame before the last input frame, that frame, and those to predict.
+    vertices = state.vertices[clip.current_frame - 1 : clip.current_frame + num_steps + 1].astype(np.float64)
     triangles = surface_of(state.tetrahedra)
     numbers = np.unique(state.vertex_objects).tolist()
     surfaces = [vertices[:, triangles[state.vertex_objects[triangles[:, 0]] == number]] for number in numbers]
-    found = [_near_surface(positions.numpy(), surface[0], margin) for surface in surfaces]
+    found = [_near_surface(positions.numpy(), surface[1], margin) for surface in surfaces]
     distances = np.stack([distance for distance, _ in found])
     bodies = {}
     for row, (number, surface) in enumerate(zip(numbers, surfaces, strict=True)):
@@ -68,9 +72,9 @@ def _soft_bodies(clip: Clip, positions: Float[Tensor, "particle 3"], margin: flo
         mask = (distance <= margin) & (distances.argmin(axis=0) == row)
         near = near.of(mask[np.isfinite(distance)])
         corners = surface[:, near.triangle]
-        moved = np.einsum("tpck,pc->tpk", corners - corners[:1], near.weights)
-        true = positions[torch.from_numpy(mask)] + torch.from_numpy(moved)
-        bodies[number] = Body(torch.from_numpy(mask), true, torch.from_numpy(surface))
+        moved = np.einsum("tpck,pc->tpk", corners - corners[1:2], near.weights)
+        places = positions[torch.from_numpy(mask)] + torch.from_numpy(moved)
+        bodies[number] = Body(torch.from_numpy(mask), places[1:], torch.from_numpy(surface[1:]), places[0])
     return bodies
 
 

@@ -97,7 +97,7 @@ def _bodies(
         return {"motion": {}, "penetration": {}}
     bodies = find_bodies(clip, positions[0], protocol.body_margin, positions.shape[0] - 1)
     return {
-        "motion": _numpy(bodies_motion(bodies, positions, constants)),
+        "motion": _numpy(bodies_motion(bodies, positions, constants, clip.frame_time)),
         "penetration": _numpy(clip_penetration(clip, bodies, positions, MIN_BODY_PARTICLES)),
     }
 

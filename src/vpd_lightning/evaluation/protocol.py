@@ -98,6 +98,12 @@ class Clip:
         poses = np.concatenate([self.state.positions[window], self.state.quaternions[window]], axis=-1)
         return torch.from_numpy(poses)
 
+    def previous_pose(self) -> Float[Tensor, "object 7"]:
+        """True poses at the frame before the last input frame."""
+        assert self.state is not None
+        frame = self.current_frame - 1
+        return torch.from_numpy(np.concatenate([self.state.positions[frame], self.state.quaternions[frame]], axis=-1))
+
 
 def read_cameras(reader: TrajectoryReader, times: Sequence[int], views: Sequence[int]) -> Cameras:
     """Return the cameras of some frames and views (axes ``time view``) in float32."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vpd_lightning.data.schema import AtomicPath
 from vpd_lightning.evaluation.evaluate import Evaluation
+from vpd_lightning.evaluation.events import events_of
 from vpd_lightning.evaluation.long_rollout import LongRollout
 from vpd_lightning.evaluation.measuring import SYSTEMS
 from vpd_lightning.evaluation.protocol import Protocol
@@ -25,8 +26,9 @@ def metrics_of(evaluation: Evaluation, protocol: Protocol, identity: Mapping[str
     """Build the content of ``metrics.json``; ``identity`` names the model, the checkpoint and the data.
 
     Every metric is an object with ``mean`` (over images), ``ci95`` (bootstrap over trajectories) and ``per_step``;
-    distances are metres. Values that do not exist are null: a system without particles has no ``chamfer``, ``motion``,
-    ``penetration`` and ``long_rollout``, one that predicts at the resolution of the truth has no ``native``.
+    distances are metres; ``events`` are figures over bodies. Values that do not exist are null: a system without
+    particles has no ``chamfer``, ``motion``, ``events``, ``penetration`` and ``long_rollout``, one that predicts at the
+    resolution of the truth has no ``native``.
     """
     systems = {system: _image_summary(evaluation, protocol, system) for system in SYSTEMS}
     summary = _summarizer(evaluation, protocol)
@@ -47,6 +49,7 @@ def metrics_of(evaluation: Evaluation, protocol: Protocol, identity: Mapping[str
         "reconstruction": {name: summary(values)["mean"] for name, values in evaluation.reconstruction.items()},
         "references": {system: systems[system] for system in SYSTEMS if system != "model"},
         "motion": _motion_summary(evaluation, protocol),
+        "events": events_of(evaluation.motion),
         "penetration": _parts_summary(evaluation.penetration, summary),
         "long_rollout": _long_summary(evaluation.long_rollouts),
         "seconds": {name: plain(value) for name, value in evaluation.seconds.items()},
@@ -94,7 +97,7 @@ def _motion_summary(evaluation: Evaluation, protocol: Protocol) -> dict[str, Any
     result = {name: summary(values) for name, values in evaluation.motion.items()}
     result["size_ratio"]["min"] = plain(np.nanmin(evaluation.motion["size_ratio"], initial=np.inf))
     result["size_ratio"]["max"] = plain(np.nanmax(evaluation.motion["size_ratio"], initial=-np.inf))
-    for reference in ("constant", "copy"):
+    for reference in ("constant", "copy", "velocity"):
         result[f"centroid_error_over_{reference}"] = _ratio(
             evaluation.motion["centroid_error"], evaluation.motion[f"centroid_error_{reference}"]
         )

@@ -21,6 +21,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     ]
     if metrics["motion"]:
         lines += ["", *_motion_lines(metrics["motion"], protocol["num_steps"])]
+        lines += _event_lines(metrics["events"])
     if metrics["long_rollout"]:
         lines += ["", *_long_lines(metrics["long_rollout"])]
     return lines
@@ -68,18 +69,39 @@ def _motion_lines(motion: Mapping[str, Any], num_steps: int) -> list[str]:
         ("centroid error (cm)", "centroid_error", 100.0, 1),
         ("  best constant (cm)", "centroid_error_constant", 100.0, 1),
         ("  nothing moves (cm)", "centroid_error_copy", 100.0, 1),
+        ("  first velocity kept (cm)", "centroid_error_velocity", 100.0, 1),
         ("  model / constant", "centroid_error_over_constant", 1.0, 2),
         ("particle error (cm)", "particle_error", 100.0, 1),
+        ("orientation error (deg)", "orientation_error", 1.0, 1),
+        ("velocity error (cm/s)", "velocity_error", 100.0, 1),
         ("block size / start", "size_ratio", 1.0, 2),
         ("distance to surface (cm)", "body_chamfer", 100.0, 1),
     ]
-    soft_only, rigid_only = "body_chamfer", "size_ratio"
-    rows = [row for row in rows if row[1] not in (soft_only, rigid_only) or motion[row[1]]["count"]]
+    of_some = ("body_chamfer", "size_ratio", "orientation_error")  # soft or rigid bodies alone have them
+    rows = [row for row in rows if row[1] not in of_some or motion[row[1]]["count"]]
     lines = [f"{'after step':24}" + "".join(f"{step:>9}" for step in steps)]
     for label, name, scale, digits in rows:
         values: Sequence[float | None] = motion[name]["per_step"]
         lines.append(
             f"{label:24}" + "".join(f"{_number(_scaled(values[step - 1], scale), digits):>9}" for step in steps)
+        )
+    return lines
+
+
+def _event_lines(events: Mapping[str, Any]) -> list[str]:
+    """What is known of contacts and rest; nothing of a set where neither happens."""
+    contact, rest = events["contact"], events["rest"]
+    lines = []
+    if contact["count"]:
+        lines.append(
+            f"first contact of {contact['count']} falls: {_number(contact['error'], 1)} steps off, "
+            f"{_number(_scaled(contact['missed'], 100), 0)}% missed"
+        )
+    if rest["count"]:
+        lines.append(
+            f"rest of {rest['count']} bodies: height {_number(_scaled(rest['height_error'], 100), 1)} cm off, "
+            f"{_number(_scaled(rest['share_within_5_cm'], 100), 0)}% within 5 cm, still moving at "
+            f"{_number(_scaled(rest['speed'], 100), 1)} cm/s"
         )
     return lines
 

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vpd_lightning.metrics.body_dynamics import best_rotation
+
 
 def rotation_matrix(quaternion: Float[Tensor, "*shape 4"]) -> Float[Tensor, "*shape 3 3"]:
     """Rotation matrix of a quaternion (w x y z), normalised first."""
@@ -64,10 +66,6 @@ def rigidity_error(
     pred: Float[Tensor, "step particle 3"], start: Float[Tensor, "particle 3"]
 ) -> Float[Tensor, " step"]:
     """Root mean square residual in metres after the best rigid motion from ``start`` (Kabsch 1976) is taken out."""
-    centred = start - start.mean(0)
-    target = pred - pred.mean(1, keepdim=True)
-    u, _, vh = torch.linalg.svd(torch.einsum("pi,spj->sij", centred, target))
-    sign = torch.ones_like(u[..., 0, :])
-    sign[..., -1] = torch.det(u @ vh).sign()
-    rotation = (u * sign.unsqueeze(-2)) @ vh
-    return (target - torch.einsum("pi,sij->spj", centred, rotation)).square().sum(-1).mean(-1).sqrt()
+    centred, target = start - start.mean(0), pred - pred.mean(1, keepdim=True)
+    turned = torch.einsum("sij,pj->spi", best_rotation(start, pred), centred)
+    return (target - turned).square().sum(-1).mean(-1).sqrt()
