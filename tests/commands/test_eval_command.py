@@ -64,7 +64,7 @@ def test_the_time_is_that_of_the_checkpoint() -> None:
         "callbacks": {"TimeBudget": {"seconds": 90.0, "seconds_before": 30.0, "steps": 12}},
         "hyper_parameters": {"callbacks": {"time_budget": {"minutes": 2.0, "clock": "cpu"}}},
         "global_step": 12,
-        "data_sha256": "ab" * 32,
+        "data_sha256": ["ab" * 32],
     }
     assert training_of(content, Path("run/checkpoints/best.ckpt")) == {
         "seconds": 120.0,
@@ -75,6 +75,8 @@ def test_the_time_is_that_of_the_checkpoint() -> None:
         "checkpoint_name": "best.ckpt",
         "data_sha256": "ab" * 32,
     }
+    both = {**content, "data_sha256": ["a", "b"]}
+    assert training_of(both, Path("a.ckpt"))["data_sha256"] == ["a", "b"]
     assert training_of({"hyper_parameters": {"callbacks": None}}, Path("a.ckpt"))["seconds"] is None
 
 

@@ -57,6 +57,15 @@ def test_every_word_of_a_sweep_composes_and_fits_its_classes(sweep: str, budget:
     assert len(different) == len(configs)  # no budget takes away what a sweep is about
 
 
+@pytest.mark.slow
+def test_every_system_fits_every_data_set_within_minutes():
+    jobs = sweep_jobs(["sweep=table2", "budget=minutes"], None)
+
+    assert len({job.folder for job in jobs}) == len(jobs) == NUM_JOBS["table2"]
+    for job in jobs:
+        check_widths(job.config)
+
+
 @pytest.mark.parametrize("sweep", SWEEPS)
 def test_every_job_of_a_sweep_has_a_place_of_its_own(sweep: str):
     jobs = expand_sweep("train", [f"sweep={sweep}"])

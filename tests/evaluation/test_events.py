@@ -41,6 +41,23 @@ def test_rest_is_judged_where_the_true_body_rests() -> None:
     assert events["rest"]["share_within_5_cm"] == 0.5 and events["rest"]["speed"] == pytest.approx(0.01)
 
 
+def test_a_prediction_that_is_not_finite_counts_against_the_system() -> None:
+    late, early = FALL.copy(), FALL.copy()
+    late[8], early[1:] = np.nan, np.nan
+    events = events_of(motion([FALL, FALL], [late, early], [0.02, 0.02]))
+
+    assert events is not None
+    assert events["contact"] == {"error": 0.0, "missed": 0.5, "invented": None, "count": 2}
+    gone = motion([FALL, FALL], [FALL, FALL], [0.02, np.nan])
+    rest = events_of(gone)["rest"]  # type: ignore[index]
+    assert rest["count"] == 2 and rest["share_within_5_cm"] == 0.5 and rest["height_error"] == pytest.approx(0.02)
+
+
+def test_rest_takes_five_steps_to_show() -> None:
+    short = {name: values[..., -4:] for name, values in motion([FALL], [FALL], [0.0]).items()}
+    assert events_of(short)["rest"]["count"] == 0  # type: ignore[index]
+
+
 def test_bodies_that_are_not_seen_do_not_count_and_no_bodies_have_no_events() -> None:
     unseen = np.full(9, np.nan)
     events = events_of(motion([unseen], [unseen], [np.nan]))

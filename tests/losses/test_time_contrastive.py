@@ -62,6 +62,14 @@ def test_gradient_draws_views_together_and_times_apart() -> None:
     features.requires_grad_()
     assert torch.autograd.gradcheck(lambda values: loss_of(values[0], values[1]), features)
 
+    def distances(values: torch.Tensor) -> tuple[float, float]:
+        units = torch.nn.functional.normalize(values, dim=-1)
+        return float((units[:, :, 0] - units[:, :, 1]).norm()), float((units[0] - units[1]).norm())
+
+    (gradient,) = torch.autograd.grad(loss_of(features[0], features[1]), features)
+    before, after = distances(features.detach()), distances(features.detach() - 0.05 * gradient)
+    assert after[0] < before[0] and after[1] > before[1]
+
 
 def test_one_view_and_other_encoders_are_refused_with_a_way_out() -> None:
     with pytest.raises(ConfigError, match="only 1.*\n.*input_views"):

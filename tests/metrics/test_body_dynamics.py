@@ -65,6 +65,9 @@ def test_contact_is_where_a_fall_loses_half_its_speed() -> None:
     velocities = torch.tensor([[fall, never], [slow, rising]], dtype=torch.float64)
     assert first_contact(velocities, 0.3).tolist() == [[3.0, torch.inf], [torch.inf, torch.inf]]
 
+    braking = torch.linspace(-3.0, 0.0, 11, dtype=torch.float64)  # evenly, over many frames
+    assert float(first_contact(torch.cat([braking.new_tensor([-1.0, -2.0]), braking]), 0.3)) == 2 + 5
+
     unknown = torch.tensor([-1.0, torch.nan, -1.0, 0.5], dtype=torch.float64)
     assert float(first_contact(unknown, 0.3)) == 3.0
     assert float(first_contact(unknown[:1], 0.3)) == torch.inf

@@ -96,7 +96,7 @@ def test_training_on_other_data_than_the_evaluation_is_told(make_run: MakeRun, t
 
     (words,) = [words for words in board_warnings(boards(tmp_path)[0]) if "trained on another data set" in words]
 
-    assert "bbbbbbbbbbbb" in words and str(same) not in words
+    assert str(other) in words and str(same) not in words
 
 
 def test_same_budgets_warn_of_nothing(make_run: MakeRun, tmp_path: Path):
@@ -258,6 +258,12 @@ def test_an_evaluation_on_other_data_is_named(make_run: MakeRun, tmp_path: Path)
 
     assert [row.name for row in board.rows if not row.is_main] == [f'vpd (evaluated_on="{"a" * 12}")']
     assert [row.runs[0].folder.name for row in board.main_rows] == ["b"]
+
+    # A digest that is known decides, whatever the folders are called.
+    for digest, is_other in (("a" * 64, False), ("b" * 64, True), (["b" * 64, "a" * 64], True)):
+        change_json(run / "evaluation" / "metrics.json", training={"data_sha256": digest})
+        [board] = boards(tmp_path)
+        assert any("evaluated_on" in row.name for row in board.rows) is is_other
 
 
 def test_settings_and_time_are_those_of_the_checkpoint(make_run: MakeRun, tmp_path: Path):

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from tests.report.made_runs import write_rollouts, write_run
 from vpd_lightning.commands.report import main
+from vpd_lightning.errors import ConfigError
+from vpd_lightning.report import films
 from vpd_lightning.report.strips import strip_steps
 
 
@@ -81,6 +83,20 @@ def test_films_show_every_system_beside_the_truth_for_all_steps(runs: Path):
     assert len(both) == len(one) == 4
     vpd = both[:, 60:150, -120:-10].astype(int)
     assert abs(vpd - 100).max() <= 8  # 100 is the shade that vpd predicted, and compression loses little of it
+
+
+def test_without_vp9_there_is_a_report_without_films(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def refuse(*_: object) -> None:
+        raise ConfigError("This OpenCV cannot write VP9.\nInstall another.")
+
+    monkeypatch.setattr(films, "write_video", refuse)
+    assert main([str(runs / "vpd0"), f"out={tmp_path / 'report'}"]) == 0
+
+    text = (tmp_path / "report/report.md").read_text()
+    assert "not shown: `films` (This OpenCV cannot write VP9.)" in text and list((tmp_path / "report").glob("strips_*"))
+    capsys.readouterr()
 
 
 def film_frames(path: Path) -> NDArray[np.uint8]:

@@ -102,9 +102,10 @@ def _write_config(path: Path, config: Mapping[str, Any]) -> None:
 def training_of(content: Mapping[str, Any], checkpoint: Path) -> dict[str, Any]:
     """Describe the training behind a checkpoint: as ``training_time.json``, but of these weights; null: not known.
 
-    ``seconds`` includes ``seconds_before`` (of a first training and what it prepared); ``data_sha256`` is the digest
-    of the data set that was trained on.
+    ``seconds`` includes ``seconds_before`` (of a first training and what it prepared). ``data_sha256`` is the digest of
+    the data set that was trained on, or all of them, in order, for a training that went on with another one.
     """
+    data = content.get(DATA_SHA256) or [None]
     state = (content.get("callbacks") or {}).get("TimeBudget") or {}
     budget = ((content.get("hyper_parameters") or {}).get("callbacks") or {}).get("time_budget") or {}
     seconds, before = state.get("seconds"), state.get("seconds_before")
@@ -115,7 +116,7 @@ def training_of(content: Mapping[str, Any], checkpoint: Path) -> dict[str, Any]:
         "clock": budget.get("clock"),
         "steps": state.get("steps", content.get("global_step")),
         "checkpoint_name": checkpoint.name,
-        "data_sha256": content.get(DATA_SHA256),
+        "data_sha256": data[0] if len(data) == 1 else data,
     }
 
 

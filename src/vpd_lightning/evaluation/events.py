@@ -18,11 +18,12 @@ _REST_HEIGHT = 0.05  # metres
 def events_of(motion: Mapping[str, NDArray[np.float64]]) -> dict[str, Any] | None:
     """Summarise ``contact`` and ``rest`` over the bodies of all clips (axes ``clip object step``); None without bodies.
 
-    ``contact`` is about the first step at which a falling body (faster than 0.3 m/s) loses half of its downward speed:
-    ``error`` is the mean difference in steps where truth and prediction have one, ``missed`` the share of true contacts
-    that the prediction lacks within the clip, ``invented`` the share of bodies without one that are predicted to have.
-    ``rest`` is about bodies whose true speed is below 0.05 m/s over the last five steps: at the last one, the mean
-    error of their lowest point (metres), the share of them within 5 cm, and their predicted speed (m/s).
+    ``contact`` is about the first step at which a body that fell (faster than 0.3 m/s) has lost half of its greatest
+    downward speed: ``error`` is the mean difference in steps where truth and prediction have one, ``missed`` the share
+    of true contacts that the prediction lacks within the clip, ``invented`` the share of bodies without one that are
+    predicted to have one. ``rest`` is about bodies whose true speed is below 0.05 m/s over the last five steps: at the
+    last one, the mean error of their lowest point (metres) and their predicted speed (m/s), both where the prediction
+    is finite, and the share of all of them that is within 5 cm. Both ``count`` what the truth has.
     """
     if not motion:
         return None
@@ -34,9 +35,9 @@ def _contact(motion: Mapping[str, NDArray[np.float64]]) -> dict[str, Any]:
         first_contact(torch.from_numpy(motion[name]), _FALL_SPEED).numpy()
         for name in ("true_vertical_velocity", "vertical_velocity")
     )
-    known = np.isfinite(motion["true_vertical_velocity"]).all(-1) & np.isfinite(motion["vertical_velocity"]).all(-1)
-    strikes, both = known & np.isfinite(true), known & np.isfinite(true) & np.isfinite(pred)
-    quiet = known & ~np.isfinite(true)
+    known = np.isfinite(motion["true_vertical_velocity"]).all(-1)
+    strikes, quiet = known & np.isfinite(true), known & ~np.isfinite(true)
+    both = strikes & np.isfinite(pred)
     return {
         "error": _mean(np.abs(pred[both] - true[both])),
         "missed": _mean(~np.isfinite(pred[strikes])),
@@ -46,12 +47,13 @@ def _contact(motion: Mapping[str, NDArray[np.float64]]) -> dict[str, Any]:
 
 
 def _rest(motion: Mapping[str, NDArray[np.float64]]) -> dict[str, Any]:
-    error, speed = motion["height_error"][..., -1], motion["speed"][..., -1]
-    resting = (motion["true_speed"][..., -_REST_STEPS:] < _REST_SPEED).all(-1) & np.isfinite(error)
+    error, speed, true_speed = (motion[name] for name in ("height_error", "speed", "true_speed"))
+    resting = (true_speed[..., -_REST_STEPS:] < _REST_SPEED).all(-1) & (true_speed.shape[-1] >= _REST_STEPS)
+    error, speed = error[..., -1][resting], speed[..., -1][resting]
     return {
-        "height_error": _mean(error[resting]),
-        "share_within_5_cm": _mean(error[resting] <= _REST_HEIGHT),
-        "speed": _mean(speed[resting]),
+        "height_error": _mean(error[np.isfinite(error)]),
+        "share_within_5_cm": _mean(error <= _REST_HEIGHT),
+        "speed": _mean(speed[np.isfinite(speed)]),
         "count": int(resting.sum()),
     }
 

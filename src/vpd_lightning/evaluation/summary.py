@@ -69,7 +69,7 @@ def _motion_lines(motion: Mapping[str, Any], num_steps: int) -> list[str]:
         ("centroid error (cm)", "centroid_error", 100.0, 1),
         ("  best constant (cm)", "centroid_error_constant", 100.0, 1),
         ("  nothing moves (cm)", "centroid_error_copy", 100.0, 1),
-        ("  first velocity kept (cm)", "centroid_error_velocity", 100.0, 1),
+        ("  velocity kept (cm)", "centroid_error_velocity", 100.0, 1),
         ("  model / constant", "centroid_error_over_constant", 1.0, 2),
         ("particle error (cm)", "particle_error", 100.0, 1),
         ("orientation error (deg)", "orientation_error", 1.0, 1),

@@ -39,10 +39,10 @@ def _row(clip: str, view: int, rollouts: dict[str, Rollout], rows: Sequence[Row]
     frames = []
     for step in range(len(truth)):
         images = [framed(enlarge(images[step], _MIN_PANEL)) for images in panels.values()]
-        heads = [label_bar(name, image.shape[1]) for name, image in zip(panels, images, strict=True)]
+        names = [f"truth, step {step + 1}", *list(panels)[1:]]
+        heads = [label_bar(name, image.shape[1]) for name, image in zip(names, images, strict=True)]
         body = np.concatenate([np.concatenate(heads, axis=1), np.concatenate(images, axis=1)])
-        title = f"{camera_title(clip, view, rollouts, rows)}, step {step + 1}"
-        frames.append(np.concatenate([label_bar(title, body.shape[1]), body]))
+        frames.append(np.concatenate([label_bar(camera_title(clip, view, rollouts, rows), body.shape[1]), body]))
     return np.stack(frames)
 
 

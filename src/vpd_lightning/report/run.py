@@ -63,10 +63,12 @@ class Run:
 
     @property
     def _is_on_other_data(self) -> bool:
+        digest = (self.metrics.get("training") or {}).get("data_sha256")
+        if digest is not None:
+            return bool(digest != self.data_sha256)
+        # Older checkpoints do not say; then the folder tells.
         trained, evaluated = _get(self.config, "data.folder"), self.metrics.get("data")
         if not isinstance(trained, str) or not isinstance(evaluated, str):
-            return False
-        if (self.metrics.get("training") or {}).get("data_sha256") == self.data_sha256:
             return False
         return trained != evaluated and Path(trained).resolve() != Path(evaluated).resolve()
 

@@ -72,7 +72,7 @@ def board_warnings(board: Board) -> list[str]:
 def _other_data(board: Board) -> list[str]:
     """Say which runs are known to have been trained on another data set than the one they were evaluated on."""
     trained = [(run, (run.metrics.get("training") or {}).get("data_sha256")) for run in board.runs]
-    other = [f"{run.folder} (`{digest[:12]}`)" for run, digest in trained if digest not in (None, board.data_sha256)]
+    other = [str(run.folder) for run, digest in trained if digest not in (None, board.data_sha256)]
     return [f"these were trained on another data set than they are evaluated on: {', '.join(other)}."] if other else []
 
 

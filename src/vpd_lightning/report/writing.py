@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vpd_lightning.data.schema import AtomicPath
+from vpd_lightning.errors import ConfigError
 from vpd_lightning.report.board import Board, boards_of
 from vpd_lightning.report.collect import Collection
 from vpd_lightning.report.films import write_films
@@ -45,8 +46,12 @@ def _pictures(folder: Path, board: Board) -> BoardFiles:
         if settings_plot(path, board, system):
             settings[system] = path
     kept = kept_rollouts(board)
-    strips, films = write_strips(folder, board, kept), write_films(folder, board, kept)
-    return BoardFiles(rollout if drawn else None, settings, sweeps, strips, films, kept.skipped)
+    strips, films, not_shown = write_strips(folder, board, kept), [], list(kept.skipped)
+    try:
+        films = write_films(folder, board, kept)
+    except ConfigError as error:  # this OpenCV has no VP9; the rest of the report does not need it
+        not_shown.append((Path("films"), str(error).splitlines()[0]))
+    return BoardFiles(rollout if drawn else None, settings, sweeps, strips, films, not_shown)
 
 
 def _with_settings(board: Board) -> Sequence[str]:

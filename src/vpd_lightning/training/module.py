@@ -19,7 +19,7 @@ from vpd_lightning.types import VideoBatch, ViewBatch
 
 BEST_METRIC = "validation/psnr"
 DATA_SHA256 = "data_sha256"
-"""Where a checkpoint keeps the digest of the data set it was trained on."""
+"""Where a checkpoint keeps the digests of the data sets it was trained on: more than one if it went on with another."""
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +56,7 @@ class VPDModule(pl.LightningModule):
         self.train_metrics: dict[str, Tensor | float] = {}
         self.expected_steps: Callable[[], int] | None = None
         self._clips: Sequence[str] = ()
+        self._earlier_data: list[str] = []
         self.seconds_per_step: float | None = None
         self._last_start: float | None = None
 
@@ -72,14 +73,19 @@ class VPDModule(pl.LightningModule):
     # -- what a checkpoint says of its data ----------------------------------------------------------------------------
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the digest of the data set that was trained on."""
-        checkpoint[DATA_SHA256] = self._data_sha256()
+        """Keep the digests of the data sets that were trained on, in order."""
+        now = self._data_sha256()
+        checkpoint[DATA_SHA256] = [*self._earlier_data, *([now] if now and now not in self._earlier_data else [])]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Warn where a training goes on with other data than before."""
-        before, now = checkpoint.get(DATA_SHA256), self._data_sha256()
-        if before and now and before != now:
-            log.warning("the data set is not what this training began with (SHA-256 %s, was %s)", now[:12], before[:12])
+        self._earlier_data, now = list(checkpoint.get(DATA_SHA256) or []), self._data_sha256()
+        if now and self._earlier_data and self._earlier_data != [now]:
+            log.warning(
+                "the data set is not what this training began with (SHA-256 %s, was %s)",
+                now[:12],
+                self._earlier_data[0][:12],
+            )
 
     def _data_sha256(self) -> str | None:
         trainer = self._trainer  # absent where a checkpoint is read without one
