@@ -14,7 +14,7 @@ from torch import nn
 import vpd_lightning
 from tests.released_model import cameras, figures, predict, synthetic_frames, write_run, write_slotformer
 from vpd_lightning.errors import CheckpointError, ConfigError
-from vpd_lightning.export.card_figures import beaten_by, figure_lines
+from vpd_lightning.export.card_figures import beaten_by, beaten_in_motion_by, figure_lines
 from vpd_lightning.export.model_card import protocol_words
 from vpd_lightning.export.output_folder import beside_checkpoint
 from vpd_lightning.export.portable import absolute_paths, portable_config, portable_data_folder
@@ -192,6 +192,16 @@ def test_the_card_says_what_it_is_and_how_good(original: Path) -> None:
     ):
         assert said in card, said
     assert "does not beat" not in card, "25.1 dB against 22.6"
+
+
+def test_the_card_sets_motion_beside_what_sees_nothing(original: Path) -> None:
+    metrics = json.loads((original / "metrics.json").read_text())
+    errors = {"centroid_error": 0.3, "centroid_error_copy": 0.9, "centroid_error_constant": 0.25}
+    metrics["motion"] = {name: {"mean": error, "ci95": None} for name, error in errors.items()}
+
+    assert "no motion 90.0 cm and the best constant displacement 25.0 cm" in "\n".join(figure_lines(metrics))
+    assert beaten_in_motion_by(metrics) == ["the best constant displacement"]
+    assert beaten_in_motion_by({"motion": None}) == []
 
 
 def test_the_card_admits_what_it_does_not_know(trained: TrainedSystem, original: Path) -> None:

@@ -27,6 +27,10 @@ def figure_lines(metrics: Mapping[str, Any]) -> list[str]:
     lines += _single_row("deepest particle in floor or bodies (cm)", metrics.get("penetration"), 100.0, 2)
     motion = metrics.get("motion") or {}
     lines += _single_row("centroid error of bodies (cm)", motion.get("centroid_error"), 100.0, 1)
+    others = _centroid_references(motion)
+    if others:
+        words = " and ".join(f"{what} {100 * error:.1f} cm" for what, error in others.items())
+        lines += ["", f"Centroid error of two references that see nothing: {words}."]
     native = metrics.get("native")
     if native:
         value = f"{_number(native['psnr'], 2)} dB, SSIM {_number(native['ssim'], 3)}"
@@ -40,6 +44,20 @@ def beaten_by(metrics: Mapping[str, Any], name: str) -> list[str]:
     words = {"copy_last": "repeating the last frame", "train_mean": "the training mean"}
     means = {reference: metrics["references"][reference][name]["mean"] for reference in REFERENCES}
     return [words[key] for key, mean in means.items() if own is not None and mean is not None and mean >= own]
+
+
+def beaten_in_motion_by(metrics: Mapping[str, Any]) -> list[str]:
+    """Return the references of the bodies' motion whose centroid error is as low as the model's, or lower."""
+    motion = metrics.get("motion") or {}
+    own = (motion.get("centroid_error") or {}).get("mean")
+    return [what for what, error in _centroid_references(motion).items() if own is not None and error <= own]
+
+
+def _centroid_references(motion: Mapping[str, Any]) -> dict[str, float]:
+    """Mean centroid error in metres of what does not look at the input, as far as known."""
+    names = {"no motion": "centroid_error_copy", "the best constant displacement": "centroid_error_constant"}
+    means = {what: (motion.get(name) or {}).get("mean") for what, name in names.items()}
+    return {what: mean for what, mean in means.items() if mean is not None}
 
 
 def _image_rows(metrics: Mapping[str, Any], label: str, name: str, digits: int) -> list[str]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vpd_lightning.export.card_figures import SCORES, beaten_by, figure_lines
+from vpd_lightning.export.card_figures import SCORES, beaten_by, beaten_in_motion_by, figure_lines
 from vpd_lightning.export.system_notes import describe_system, reads_depth, renders_any_camera
 
 
@@ -169,6 +169,7 @@ def _limit_lines(content: CardContent) -> list[str]:
         lines += [
             f"- **By {label.partition(' (')[0]} it does not beat {what}.**" for what in beaten_by(content.metrics, name)
         ]
+    lines += [f"- **By centroid error it does not beat {what}.**" for what in beaten_in_motion_by(content.metrics)]
     if not renders_any_camera(system):
         lines.append("- It predicts the views it is given and no others.")
     elif content.metrics["psnr"].get("other_views") is None:
