@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.training.tiny_training import tiny_simulator
+from vpd_lightning.config import compose
 from vpd_lightning.training.optimization import StepDecayAdam, WarmupCosineAdam
 
 ADAM = {"betas": [0.9, 0.999], "eps": 1e-8}
@@ -51,6 +52,13 @@ def test_a_multiplier_of_no_stage_is_refused() -> None:
     settings = WarmupCosineAdam(lr=1.0, stage_multipliers={"decoder": 2.0}, warmup_steps=0, final_share=1.0, **ADAM)
     with pytest.raises(ValueError, match="'decoder', but the stages are encoder, dynamics, renderer"):
         settings.build(tiny_simulator(), max_steps=1)
+    neutral = WarmupCosineAdam(lr=1.0, stage_multipliers={"decoder": 1.0}, warmup_steps=0, final_share=1.0, **ADAM)
+    assert neutral.build(tiny_simulator(), max_steps=1)
+
+
+def test_every_stage_has_a_multiplier_to_set_on_the_command_line() -> None:
+    config = compose("train", ["experiment=demo", "optimizer.stage_multipliers.dynamics=0.1", "run.folder=x"])
+    assert config["optimizer"]["stage_multipliers"] == {"encoder": 1.0, "dynamics": 0.1, "renderer": 1.0}
 
 
 @pytest.mark.parametrize(

@@ -36,10 +36,11 @@ class AbstractOptimization(ABC):
         learns how many updates that allows.
 
         Stages are the direct children of the simulator; a stage without a multiplier has 1. Raises ValueError where a
-        multiplier names no stage.
+        multiplier other than 1 names no stage.
         """
         stages = dict(simulator.named_children())
-        unknown = sorted(set(self.stage_multipliers) - set(stages))
+        # Systems have different stages, and the default of 1 for the usual three concerns none of the others.
+        unknown = sorted(name for name, value in self.stage_multipliers.items() if value != 1 and name not in stages)
         if unknown:
             raise ValueError(f"stage_multipliers name {unknown[0]!r}, but the stages are {', '.join(stages)}")
         groups: list[dict[str, Any]] = []
