@@ -181,6 +181,8 @@ class TestLosses(ChosenOption, LossContract):
         names = ("predicted_features", "target_features", "predicted_slots", "target_slots")
         auxiliary = {name: torch.rand(*shape, 5, 4, **draw) for name in names}
         auxiliary["point_mass"] = torch.rand(*shape, 5, **draw)
+        for name in ("previous_view_features", "view_features"):
+            auxiliary[name] = torch.randn(shape[0], 3, 4, **draw)
         auxiliary["predicted_depth"] = 1 + torch.rand(batch.context.depth[:, 1].shape, **draw)
         return replace(made, auxiliary={name: value.to(batch.rgbs) for name, value in auxiliary.items()})
 
