@@ -62,6 +62,9 @@ def test_it_says_the_same_in_float64_and_stays_finite(folder: Path) -> None:
     size = picture_size(model)
     placed, distance = known_cameras(model, size)
     rgb, depth = synthetic_frames(past, len(views), size=size, distance=distance)
+    # All cameras stand at one place: on level ground each point would be there once per view, and which of its copies
+    # is a neighbour would be a matter of rounding.
+    depth = depth * (1 + 0.02 * torch.rand(depth.shape, generator=torch.Generator().manual_seed(1)))
     seen = placed[:1] if isinstance(model.simulator, Simulator) else placed
 
     def predict(num_steps: int, dtype: torch.dtype) -> torch.Tensor:
@@ -70,8 +73,8 @@ def test_it_says_the_same_in_float64_and_stays_finite(folder: Path) -> None:
         return system.predict_frames(context, over_time(seen, num_steps).to(dtype))
 
     # Weights are stored in float32. A neighbour more or less at the rim of a radius changes single pixels, no picture.
-    difference = (predict(STEPS, torch.float32).double() - predict(STEPS, torch.float64).double()).abs()
-    assert difference.median() < 1e-3 and difference.mean() < 1e-2
+    difference = predict(STEPS, torch.float32).double() - predict(STEPS, torch.float64).double()
+    assert difference.abs().mean() < 1e-3
     assert torch.isfinite(predict(LONG, torch.float32)).all()
 
 
