@@ -118,7 +118,7 @@ def _build_system(config: dict[str, Any]) -> AbstractSystem:
 
 def _fit_background(system: AbstractSystem, datamodule: Any) -> None:
     background = getattr(getattr(system, "encoder", None), "background", None)
-    if background is not None:
+    if background is not None and background.needs_fit:
         background.fit(*datamodule.median_background())
 
 

@@ -1,12 +1,14 @@
-"""Where moving particles are in relation to what stands still, and keeping them out of it."""
+"""Contact: bodies kept out of what stands still and out of one another, with friction and bounce."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from vpd_lightning.dynamics.rigid_motion import Twists, cross, rotate, rotation_from_spin
+from vpd_lightning.dynamics.body_motion import BodyMotion, Inertia, Push
+from vpd_lightning.dynamics.materials import Materials
+from vpd_lightning.dynamics.rigid_motion import cross, rotate, rotation_from_spin
 
 
 @dataclass(frozen=True)
@@ -16,6 +18,47 @@ class Contacts:
     distances: Float[Tensor, "batch probe"]
     normals: Float[Tensor, "batch probe 3"]
     lateral: Float[Tensor, "batch probe"]
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """A step after contact: how far bodies go in it, and with what velocity they go on from it."""
+
+    step: BodyMotion
+    onward: BodyMotion
+    touching: Bool[Tensor, "batch body 1"]
+
+
+@dataclass(frozen=True)
+class _Touch:
+    """One resolved contact of each body, to be looked at again for the velocity after the impact."""
+
+    arms: Float[Tensor, "batch body 3"]
+    normals: Float[Tensor, "batch body 3"]
+    approach: Float[Tensor, "batch body 1"]
+    is_active: Bool[Tensor, "batch body 1"]
+
+
+@dataclass(frozen=True)
+class ContactPoints:
+    """Points of bodies that may touch something; ``members`` is 1 where a point belongs to a body, else 0."""
+
+    positions: Float[Tensor, "batch probe 3"]
+    normals: Float[Tensor, "batch probe 3"]
+    members: Float[Tensor, "batch body probe"]
+
+    @property
+    def bodies(self) -> Int[Tensor, "batch probe"]:
+        """Return the body of each point; 0 where it has none."""
+        return self.members.argmax(dim=1)
+
+
+@dataclass(frozen=True)
+class BodyContacts:
+    """For each probe: the nearest probe of another body whose normal is known, and whether that says anything."""
+
+    other: Int[Tensor, "batch probe"]
+    known: Bool[Tensor, "batch probe"]
 
 
 def nearest_static_contacts(
@@ -47,54 +90,235 @@ def nearest_static_contacts(
     )
 
 
-def resolve_contacts(
-    twists: Twists,
-    positions: Float[Tensor, "batch probe 3"],
-    contacts: Contacts,
-    belongs: Bool[Tensor, "batch anchor probe"],
-    inverse_inertia: Float[Tensor, "batch anchor 3 3"],
-    friction: Float[Tensor, ""],
-    *,
-    num_iterations: int,
-    max_depth: float,
-) -> Twists:
-    """Correct the twists of one step so that no probe ends up inside what stands still.
+@torch.no_grad()
+def nearest_body_contacts(
+    points: ContactPoints,
+    reach: Float[Tensor, " batch"],
+    max_depth: Float[Tensor, "batch probe"],
+) -> BodyContacts:
+    """Find for each probe the surface of another body that it may touch.
 
-    Position-based dynamics (Mueller et al. 2007, 2020): each round takes the deepest probe of each anchor and applies
-    the smallest impulse at that point that lifts it out, to displacement and spin alike, and an impulse against its
-    sliding of at most ``friction`` times that (Coulomb). What is carried on to the next step has lost the motion into
-    the surface: an inelastic impact; a body that tips over an edge gets its torque. Bounce is left to what is learned.
-    Probes that were deeper than ``max_depth`` (metres) before the step are left alone: their surface is not to be
-    trusted.
+    A probe that lies beside the surface's nearest point by more than ``reach`` (metres) is not above that surface, and
+    one deeper below it than its ``max_depth`` came from the other side.
     """
-    offsets = positions[:, None] - twists.centers[:, :, None]
-    normals = contacts.normals[:, None].expand_as(offsets)
-    known = (contacts.normals.square().sum(dim=-1) > 0.5) & (contacts.distances > -max_depth)
-    touchable = belongs & known[:, None]
-    displacements, spins = twists.displacements, twists.spins
-    for _ in range(num_iterations):
-        turned = rotate(rotation_from_spin(spins)[:, :, None], offsets)
-        moves = displacements[:, :, None] + turned - offsets
+    positions, normals, is_owned = points.positions, points.normals, points.members.any(dim=1)
+    bodies = torch.where(is_owned, points.bodies, -1)
+    oriented = is_owned & (normals.square().sum(dim=-1) > 0.5)
+    different = (bodies[:, :, None] != bodies[:, None]) & oriented[:, None] & is_owned[:, :, None]
+    square = (positions[:, :, None] - positions[:, None]).square().sum(dim=-1).masked_fill(~different, torch.inf)
+    nearest_square, other = square.min(dim=-1)
+    offset = positions - _points(positions, other)
+    height = (offset * _points(normals, other)).sum(dim=-1)
+    beside = nearest_square - height.square()
+    known = torch.isfinite(nearest_square) & (beside < reach[:, None].square()) & (height > -max_depth)
+    return BodyContacts(other, known)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """One contact of every ordered pair of bodies; those that do not touch are inactive."""
+
+    first: Int[Tensor, "batch pair"]
+    second: Int[Tensor, "batch pair"]
+    first_arms: Float[Tensor, "batch pair 3"]
+    second_arms: Float[Tensor, "batch pair 3"]
+    normals: Float[Tensor, "batch pair 3"]
+    approach: Float[Tensor, "batch pair 1"]
+    is_active: Bool[Tensor, "batch pair 1"]
+
+    def sides(self) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        return (self.first, self.first_arms), (self.second, self.second_arms)
+
+    def relative(self, motion: BodyMotion) -> Float[Tensor, "batch pair 3"]:
+        """Return the velocity (metres per step) of the first body's point as seen from the second's."""
+        first, second = (_velocity(_gathered(_as_push(motion), index), arms) for index, arms in self.sides())
+        return first - second
+
+    @property
+    def touching(self) -> Bool[Tensor, "batch body 1"]:
+        """Whether each body is in any active pair."""
+        count = round(self.first.shape[1] ** 0.5)
+        active = self.is_active.view(-1, count, count)
+        return (active.any(dim=1) | active.any(dim=2))[..., None]
+
+
+class ContactSolver:
+    """Corrects the motion of one step so that no probe ends up inside what stands still or inside another body.
+
+    Position-based dynamics (Mueller et al. 2007, 2020): each round takes the deepest probe of each body and applies
+    the smallest push at that point that lifts it out, to displacement, spin and stretch alike, and a push against its
+    sliding of at most friction times that (Coulomb). Bodies push each other with equal and opposite impulses, so that
+    momentum is kept. What is carried on to the next step has lost the motion into the surface, but for the share that
+    restitution gives back of what came faster than ``rest_speed`` (metres per step). Probes that were deeper than
+    ``max_depth`` (metres) before the step are left alone: their surface is not to be trusted.
+    """
+
+    def __init__(
+        self,
+        *,
+        points: ContactPoints,
+        inertia: Inertia,
+        materials: Materials,
+        masses: Float[Tensor, "batch body 1"],
+        rest_speed: Tensor,
+    ):
+        self.points = points
+        self.inertia, self.materials, self.masses, self.rest_speed = inertia, materials, masses, rest_speed
+
+    def resolve(
+        self,
+        free: BodyMotion,
+        static: Contacts,
+        between: BodyContacts | None,
+        *,
+        num_iterations: int,
+        max_depth: float,
+    ) -> Resolved:
+        """Return the step without penetration; ``static`` says what stands still near each point."""
+        known = (static.normals.square().sum(dim=-1) > 0.5) & (static.distances > -max_depth)
+        touchable = (self.points.members > 0) & known[:, None]
+        motion, touches = free, []
+        touching = torch.zeros_like(self.masses, dtype=torch.bool)
+        pairs: list[_Pairs] = []
+        for _ in range(num_iterations):
+            if between is not None:
+                motion, pair = self._part(motion, free, between)
+                pairs.append(pair)
+                touching = touching | pair.touching
+            motion, touch = self._lift(motion, free, static, touchable)
+            touches.append(touch)
+            touching = touching | touch.is_active
+        onward = motion
+        for pair in pairs:
+            onward = self._bounce_apart(onward, pair)
+        for touch in touches:
+            onward = self._bounce(onward, touch)
+        return Resolved(motion, onward, touching)
+
+    def _lift(
+        self, motion: BodyMotion, free: BodyMotion, contacts: Contacts, touchable: Tensor
+    ) -> tuple[BodyMotion, _Touch]:
+        """Lift the deepest point of each body out of what stands still, and slow its sliding."""
+        offsets = self.points.positions[:, None] - motion.centers[:, :, None]
+        normals = contacts.normals[:, None].expand_as(offsets)
+        turned = motion.turned(offsets)
+        moves = motion.displacements[:, :, None] + turned - offsets
         ahead = contacts.distances[:, None] + (moves * normals).sum(dim=-1)
         deepest, probe = ahead.masked_fill(~touchable, torch.inf).min(dim=-1, keepdim=True)
-        at = probe[..., None].expand(-1, -1, -1, 3)
-        normal = torch.gather(normals, 2, at).squeeze(2)
-        arm = torch.gather(turned, 2, at).squeeze(2)
-        lift = torch.relu(-deepest) * _response(arm, normal, inverse_inertia)
-        push = lift * normal
-        displacements, spins = displacements + push, spins + rotate(inverse_inertia, cross(arm, push))
+        normal, arm, move = (_at(values, probe) for values in (normals, turned, moves))
+        lift = torch.relu(-deepest) / self.inertia.response(arm, normal)
+        push = self.inertia.push(arm, lift * normal)
+        motion = motion.pushed(push)
 
-        move = torch.gather(moves, 2, at).squeeze(2) + push + cross(rotate(inverse_inertia, cross(arm, push)), arm)
+        move = move + _velocity(push, arm)
         sliding = move - (move * normal).sum(dim=-1, keepdim=True) * normal
         speed = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
         direction = sliding / speed
-        stop = speed * _response(arm, direction, inverse_inertia)
-        push = -torch.minimum(stop, friction * lift) * direction
-        displacements, spins = displacements + push, spins + rotate(inverse_inertia, cross(arm, push))
-    return Twists(twists.centers, displacements, spins)
+        stop = speed / self.inertia.response(arm, direction)
+        drag = -torch.minimum(stop, self.materials.friction * lift) * direction
+        motion = motion.pushed(self.inertia.push(arm, drag))
+        approach = -(_velocity(_as_push(free), arm) * normal).sum(dim=-1, keepdim=True)
+        return motion, _Touch(arm, normal, approach, (lift > 0) & torch.isfinite(deepest))
+
+    def _bounce(self, motion: BodyMotion, touch: _Touch) -> BodyMotion:
+        """Give back a share of the approach, or at least take all of it away."""
+        speed = (_velocity(_as_push(motion), touch.arms) * touch.normals).sum(dim=-1, keepdim=True)
+        wanted = self.materials.restitution * torch.relu(touch.approach - self.rest_speed)
+        lift = torch.relu(wanted - speed) / self.inertia.response(touch.arms, touch.normals)
+        return motion.pushed(self.inertia.push(touch.arms, lift * touch.is_active * touch.normals))
+
+    def _part(self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts) -> tuple[BodyMotion, "_Pairs"]:
+        """Push apart each pair of bodies at its deepest contact, half as far as needed from either side."""
+        offsets = self.points.positions[:, None] - motion.centers[:, :, None]
+        turned = (self.points.members[..., None] * motion.turned(offsets)).sum(dim=1)
+        own = self.points.bodies
+        there = _points(motion.centers + motion.displacements, own) + turned
+        facing = rotate(_matrices(rotation_from_spin(motion.spins), own), self.points.normals)
+        facing = _points(facing, contacts.other)
+        gaps = ((there - _points(there, contacts.other)) * facing).sum(dim=-1)
+        count = self.points.members.shape[1]
+        bodies = torch.arange(count, device=own.device)
+        from_first = own[:, None, None] == bodies[:, None, None]
+        to_second = torch.gather(own, 1, contacts.other)[:, None, None] == bodies[:, None]
+        usable = contacts.known[:, None, None] & from_first & to_second  # batch body body probe
+        deepest, probe = gaps[:, None, None].expand(usable.shape).masked_fill(~usable, torch.inf).min(dim=-1)
+        depth, probe = torch.relu(-deepest).flatten(1)[..., None], probe.flatten(1)
+        pairs = _Pairs(
+            first=bodies.repeat_interleave(count).expand(len(own), -1),
+            second=bodies.repeat(count).expand(len(own), -1),
+            first_arms=_points(turned, probe),
+            second_arms=_points(turned, torch.gather(contacts.other, 1, probe)),
+            normals=_points(facing, probe),
+            approach=torch.zeros_like(depth),
+            is_active=depth > 0,
+        )
+        pairs = replace(pairs, approach=-(pairs.relative(free) * pairs.normals).sum(dim=-1, keepdim=True))
+        impulse = 0.5 * depth / self._pair_response(pairs, pairs.normals)
+        sliding = pairs.relative(motion)
+        sliding = sliding - (sliding * pairs.normals).sum(dim=-1, keepdim=True) * pairs.normals
+        speed = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+        direction = sliding / speed
+        friction = self._pair_mean(self.materials.friction, pairs)
+        drag = torch.minimum(0.5 * speed / self._pair_response(pairs, direction), friction * impulse)
+        return self._pair_pushed(motion, pairs, impulse * pairs.normals - drag * direction), pairs
+
+    def _bounce_apart(self, motion: BodyMotion, pairs: "_Pairs") -> BodyMotion:
+        """Give back a share of the approach of two bodies, or at least take all of it away."""
+        speed = (pairs.relative(motion) * pairs.normals).sum(dim=-1, keepdim=True)
+        wanted = self._pair_mean(self.materials.restitution, pairs) * torch.relu(pairs.approach - self.rest_speed)
+        impulse = 0.5 * torch.relu(wanted - speed) / self._pair_response(pairs, pairs.normals)
+        return self._pair_pushed(motion, pairs, impulse * pairs.is_active * pairs.normals)
+
+    @staticmethod
+    def _pair_mean(values: Tensor, pairs: "_Pairs") -> Tensor:
+        """Return the geometric mean of what two bodies are made of."""
+        return (_points(values, pairs.first) * _points(values, pairs.second)).clamp(min=1e-12).sqrt()
+
+    def _pair_response(self, pairs: "_Pairs", directions: Tensor) -> Tensor:
+        """Return how far two bodies part, each at its contact, for a unit impulse."""
+        each = [
+            self.inertia.gathered(index).response(arm, directions) / _points(self.masses, index)
+            for index, arm in pairs.sides()
+        ]
+        return each[0] + each[1]
+
+    def _pair_pushed(self, motion: BodyMotion, pairs: "_Pairs", impulses: Tensor) -> BodyMotion:
+        for sign, (index, arm) in zip((1, -1), pairs.sides(), strict=True):
+            push = self.inertia.gathered(index).push(arm, sign * impulses / _points(self.masses, index))
+            motion = motion.pushed(_summed(push, index, self.points.members.shape[1]))
+        return motion
 
 
-def _response(arm: Tensor, direction: Tensor, inverse_inertia: Tensor) -> Tensor:
-    """Return the impulse along ``direction`` that moves the point at ``arm`` by one unit along it, for unit mass."""
-    lever = cross(arm, direction)
-    return 1 / (1 + (lever * rotate(inverse_inertia, lever)).sum(dim=-1, keepdim=True))
+def _as_push(motion: BodyMotion) -> Push:
+    return Push(motion.displacements, motion.spins, motion.strains)
+
+
+def _velocity(push: Push, arms: Tensor) -> Tensor:
+    """Return the velocity (metres per step) of the point at an arm."""
+    return push.displacements + cross(push.spins, arms) + rotate(push.strains, arms)
+
+
+def _gathered(push: Push, index: Tensor) -> Push:
+    return Push(_points(push.displacements, index), _points(push.spins, index), _matrices(push.strains, index))
+
+
+def _summed(push: Push, index: Tensor, count: int) -> Push:
+    """Add up pushes (``batch contact``) by the body they act on."""
+
+    def add(values: Tensor) -> Tensor:
+        flat = index.reshape(*index.shape, *[1] * (values.dim() - 2)).expand_as(values)
+        return values.new_zeros(len(values), count, *values.shape[2:]).scatter_add(1, flat, values)
+
+    return Push(add(push.displacements), add(push.spins), add(push.strains))
+
+
+def _points(values: Float[Tensor, "batch any c"], index: Int[Tensor, "batch point"]) -> Tensor:
+    return torch.gather(values, 1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+
+def _matrices(values: Float[Tensor, "batch any 3 3"], index: Int[Tensor, "batch point"]) -> Tensor:
+    return torch.gather(values, 1, index[..., None, None].expand(-1, -1, 3, 3))
+
+
+def _at(values: Float[Tensor, "batch body probe 3"], probe: Int[Tensor, "batch body 1"]) -> Tensor:
+    return torch.gather(values, 2, probe[..., None].expand(-1, -1, -1, 3)).squeeze(2)

@@ -1,4 +1,4 @@
-"""Inertial dynamics: what moves keeps moving as a locally rigid body; a graph network predicts the corrections."""
+"""Inertial dynamics: what moves keeps moving, as rigid or soft bodies; networks learn forces and materials."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -10,21 +10,25 @@ from torch import Tensor, nn
 
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.body_forces import BodyForces
-from vpd_lightning.dynamics.contact import nearest_static_contacts, resolve_contacts
-from vpd_lightning.dynamics.rigid_motion import (
-    Twists,
-    anchor_weights,
-    equidistant_centers,
-    farthest_points,
-    fit_twists,
-    invert_inertia,
-    match_locally_rigid,
-    rotate,
-    rotation_from_spin,
+from vpd_lightning.dynamics.body_motion import BodyMotion, body_inertia
+from vpd_lightning.dynamics.contact import (
+    BodyContacts,
+    ContactPoints,
+    ContactSolver,
+    Resolved,
+    nearest_body_contacts,
+    nearest_static_contacts,
 )
+from vpd_lightning.dynamics.first_velocity import FirstVelocity, Surfels, point_spacing
+from vpd_lightning.dynamics.materials import MaterialNetwork, Materials
+from vpd_lightning.dynamics.rigid_motion import equidistant_centers, fit_twists, rotate, rotation_from_spin
 from vpd_lightning.dynamics.shading import MovingShading, StaticShading
+from vpd_lightning.graph.bodies import label_bodies
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles, require_finite
+
+_PAIR_REACH = 1.5
+"""Spacings beside the nearest particle of another body within which that still says where its surface is."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +37,13 @@ class InertialMemory:
 
     index: Int[Tensor, "batch moving"]  # slots of the moving candidates among all particles
     mask: Bool[Tensor, "batch moving"]
-    displacements: Float[Tensor, "batch moving 3"]  # of the last step, exact from the second prediction on
-    fit_weights: Float[Tensor, "batch anchor moving"]  # rows sum to one: which particles an anchor is fitted to
-    centers: Float[Tensor, "batch anchor 3"]  # of the body an anchor belongs to; carried along as if it were a particle
-    center_displacements: Float[Tensor, "batch anchor 3"]
-    body_weights: Float[Tensor, "batch anchor moving"]  # rows sum to one, wider than fit_weights: whose mass it is
-    blend_weights: Float[Tensor, "batch anchor moving"]  # columns sum to one: which anchors carry a particle
+    bodies: Float[Tensor, "batch body moving"]  # 1 where a particle belongs to a body, else 0
+    motion: BodyMotion  # the velocity with which bodies go into the next step
+    materials: Materials
+    masses: Float[Tensor, "batch body 1"]
+    spacing: Float[Tensor, " batch"]  # of the moving candidates (metres)
     normals: Float[Tensor, "batch moving 3"]
+    mirrored: Bool[Tensor, "batch moving"]  # whose mirror image may be a point of the hidden side
     first_features: Float[Tensor, "batch moving feature"]
     first_normals: Float[Tensor, "batch moving 3"]
     static_index: Int[Tensor, "batch static"]
@@ -51,11 +55,15 @@ class InertialMemory:
 class InertialDynamics(AbstractDynamics):
     """Newton's first law built in, the second learned.
 
-    The first velocity comes from locally rigid soft matching of the two frames; afterwards correspondences are exact.
-    Each step fits the last displacement by one twist per anchor, lets ``BodyForces`` correct the twists, keeps them out
-    of what stands still (``resolve_contacts``), and moves the particles by the blended twists. Particles that are not
-    candidates for motion keep their place exactly. Features change only by shading: a turned surface, a moved shadow.
-    At initialisation this is a screw motion that contact alone changes, but for 0.7 % of damping a step.
+    What may move is divided into bodies (``graph.bodies``); ``first_velocity`` says how each moved between the two
+    frames. Each step goes on with the carried velocity, lets ``BodyForces`` push, lets what is stretched return, keeps
+    bodies out of what stands still and of one another (``ContactSolver``), and moves their particles. How a body
+    slides, bounces, weighs and deforms is inferred from its features (``MaterialNetwork``). A body that touches
+    something and hardly moves stops (``rest_share`` of ``force_scale``). Particles that are not candidates for motion
+    keep their place exactly. Features change only by shading: a turned surface, a moved shadow.
+
+    Neither gravity nor a floor is built in: at initialisation this is free motion that contact alone changes, but for
+    0.7 % of damping a step. With ``first_velocity`` null, bodies start at rest.
     """
 
     # Paper: the dynamics is a hierarchical GNN without velocities or correspondences; this one is ours
@@ -66,44 +74,52 @@ class InertialDynamics(AbstractDynamics):
         *,
         feature_dim: int,
         hidden_dim: int,
-        num_anchors: int,
-        anchor_radius: float,
-        body_radius: float,
+        num_bodies: int,
+        body_link: float,
+        max_concavity: float,
+        max_concave_share: float,
+        first_velocity: FirstVelocity | None,
         num_probes: int,
         message_passing_steps: int,
         num_forces: int,
         location_scale: float,
+        force_scale: float,
         contact_range: float,
         contact_reach: float,
         num_contact_iterations: int,
         max_contact_depth: float,
-        match_scales: Sequence[float],
-        match_color_scale: float,
-        match_radius: float,
-        num_matched: int,
+        mirror_hidden: bool,
+        is_soft: bool,
+        rest_share: float,
         shadow_scales: Sequence[float],
     ):
         super().__init__()
-        for name, value in (("num_anchors", num_anchors), ("num_probes", num_probes), ("num_matched", num_matched)):
+        for name, value in (("num_bodies", num_bodies), ("num_probes", num_probes)):
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
-        for name, scale in (("anchor_radius", anchor_radius), ("location_scale", location_scale)):
+        for name, scale in (("body_link", body_link), ("location_scale", location_scale), ("force_scale", force_scale)):
             if scale <= 0:
                 raise ValueError(f"{name} must be positive, got {scale}")
-        self.num_anchors, self.num_probes, self.num_matched = num_anchors, num_probes, num_matched
-        self.anchor_radius, self.body_radius, self.match_radius = anchor_radius, body_radius, match_radius
-        self.match_scales, self.match_color_scale = list(match_scales), match_color_scale
+        if rest_share < 0:
+            raise ValueError(f"rest_share must not be negative, got {rest_share}")
+        self.num_bodies, self.num_probes = num_bodies, num_probes
+        self.body_link, self.max_concavity, self.max_concave_share = body_link, max_concavity, max_concave_share
+        self.force_scale, self.rest_share = force_scale, rest_share
         self.contact_range, self.contact_reach = contact_range, contact_reach
         self.num_contact_iterations, self.max_contact_depth = num_contact_iterations, max_contact_depth
+        self.mirror_hidden = mirror_hidden
+        self.first_velocity = first_velocity
         self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
-        self.log_friction = nn.Parameter(torch.tensor(0.5).log())
+        self.log_rest_speed = nn.Parameter(torch.tensor(0.3 * force_scale).log())
         self.forces = BodyForces(
             hidden_dim=hidden_dim,
             message_passing_steps=message_passing_steps,
             num_forces=num_forces,
-            scale=location_scale,
+            location_scale=location_scale,
+            force_scale=force_scale,
             contact_range=contact_range,
         )
+        self.materials = MaterialNetwork(feature_dim=feature_dim, hidden_dim=hidden_dim, is_soft=is_soft)
         self.moving_shading = MovingShading(feature_dim=feature_dim, hidden_dim=hidden_dim)
         self.static_shading = StaticShading(feature_dim=feature_dim, hidden_dim=hidden_dim, scales=shadow_scales)
 
@@ -112,78 +128,82 @@ class InertialDynamics(AbstractDynamics):
         return particles.mask if particles.moving is None else particles.mask & particles.moving
 
     def initialize(self, previous: Particles, current: Particles, keys: RandomKeys) -> InertialMemory:
-        """Estimate the first velocities and attach the moving candidates to anchors."""
-        if previous.colors is None or current.colors is None or current.normals is None:
-            raise ValueError("the inertial dynamics needs observed colors and normals; set encoder.use_normals=true")
+        """Divide what may move into bodies, and estimate their first velocities."""
+        for particles in (previous, current):
+            if particles.colors is None or particles.normals is None:
+                raise ValueError(
+                    "the inertial dynamics needs observed colors and normals; set encoder.use_normals=true"
+                )
         previous, current = previous.without_padding(), current.without_padding()
         require_finite(
             "Dynamics",
             positions=torch.cat([previous.positions, current.positions], dim=1),
             features=current.features,
-            colors=torch.cat([previous.colors, current.colors], dim=1),
-            normals=current.normals,
+            colors=torch.cat([previous.colors, current.colors], dim=1),  # type: ignore[list-item]
+            normals=torch.cat([previous.normals, current.normals], dim=1),  # type: ignore[list-item]
         )
         with torch.autocast(current.positions.device.type, enabled=False):  # geometry in full precision
-            return self._first_memory(previous, current)
+            return self._first_memory(_with_a_slot(previous), _with_a_slot(current))
 
     def _first_memory(self, previous: Particles, current: Particles) -> InertialMemory:
-        previous, current = _with_a_slot(previous), _with_a_slot(current)
         movable = self._movable(current)
         index, mask = _gather_index(movable)
-        positions = _take(current.positions, index)
+        seen = _surfels(current, index, mask)
+        labels = label_bodies(
+            seen.positions,
+            seen.normals,
+            mask,
+            num_bodies=self.num_bodies,
+            link=self.body_link,
+            max_concavity=self.max_concavity,
+            max_concave_share=self.max_concave_share,
+        )
+        numbers = torch.arange(self.num_bodies, device=labels.device)
+        bodies = (labels[:, None] == numbers[:, None]).to(current.positions.dtype)
+        shares = bodies / bodies.sum(dim=-1, keepdim=True).clamp(min=1)
+        displacements = torch.zeros_like(seen.positions)
+        if self.first_velocity is not None:
+            before = _surfels(previous, *_gather_index(self._movable(previous)))
+            displacements = self.first_velocity(seen, bodies, before).displacements
         with torch.no_grad():
-            displacements = self._first_displacements(previous, positions, _take(current.colors, index), mask)
-            anchors = farthest_points(positions, mask, self.num_anchors)
-            affinity = anchor_weights(anchors, positions, mask, self.anchor_radius)
-            wide = anchor_weights(anchors, positions, mask, self.body_radius)
-            normals = _take(current.normals, index)
-            body_weights, fit_weights = _normalize(wide, dim=-1), _normalize(affinity, dim=-1)
-            centers = equidistant_centers(positions, normals, body_weights)
-            twists = fit_twists(positions, displacements, fit_weights)
-            center_displacements = centers - _apply_each(centers, _reverse(twists))
+            centers = equidistant_centers(seen.positions, seen.normals, shares)
             static_index, static_mask = _gather_index(current.mask & ~movable)
-            surroundings = self.static_shading.surroundings(_take(current.positions, static_index), positions, mask)
+            static_positions = _take(current.positions, static_index)
+            surroundings = self.static_shading.surroundings(static_positions, seen.positions, mask)
+            mirrored = mask & self._may_be_hidden(current, seen, bodies, centers, static_index, static_mask)
+            spacing = point_spacing(seen.positions, mask)
+        materials = self.materials(seen.features, shares)
         return InertialMemory(
             index=index,
             mask=mask,
-            displacements=displacements,
-            fit_weights=fit_weights,
-            centers=centers,
-            center_displacements=center_displacements,
-            body_weights=body_weights,
-            blend_weights=_normalize(affinity, dim=1),
-            normals=normals,
-            first_features=_take(current.features, index),
-            first_normals=normals,
+            bodies=bodies,
+            motion=_first_motion(seen.positions, displacements, shares, centers),
+            materials=materials,
+            masses=materials.density * _volumes(seen.positions, centers, shares),
+            spacing=spacing,
+            normals=seen.normals,
+            mirrored=mirrored,
+            first_features=seen.features,
+            first_normals=seen.normals,
             static_index=static_index,
             static_mask=static_mask,
             static_features=_take(current.features, static_index),
             static_surroundings=surroundings,
         )
 
-    def _first_displacements(self, previous: Particles, positions: Tensor, colors: Tensor, mask: Tensor) -> Tensor:
-        """Match (some of) the moving candidates to those of the previous frame and spread the rigid motion to all."""
-        target_index, target_mask = _gather_index(self._movable(previous))
-        some, target_some = slice(0, self.num_matched), slice(0, 2 * self.num_matched)  # slots are in random order
-        matched = match_locally_rigid(
-            positions[:, some],
-            colors[:, some],
-            mask[:, some],
-            _take(previous.positions, target_index[:, target_some]),
-            _take(previous.colors, target_index[:, target_some]),  # type: ignore[arg-type]
-            target_mask[:, target_some],
-            num_anchors=self.num_anchors,
-            radius=self.match_radius,
-            match_scales=self.match_scales,
-            color_scale=self.match_color_scale,
-        )
-        anchors = farthest_points(positions[:, some], mask[:, some], self.num_anchors)
-        affinity = anchor_weights(anchors, positions, mask, self.match_radius)
-        displacements = positions[:, some] - matched
-        twists = fit_twists(positions[:, some], displacements, _normalize(affinity[:, :, some], dim=-1))
-        carried = positions - _apply_twists(positions, _reverse(twists), _normalize(affinity, dim=1))
-        both_seen = mask.any(dim=1) & target_mask.any(dim=1)
-        return carried * (mask & both_seen[:, None])[..., None]
+    def _may_be_hidden(
+        self,
+        current: Particles,
+        seen: Surfels,
+        bodies: Tensor,
+        centers: Tensor,
+        static_index: Tensor,
+        static_mask: Tensor,
+    ) -> Bool[Tensor, "batch moving"]:
+        """Return whose mirror image through the centre does not lie inside what stands still: nothing can be there."""
+        mirrored = 2 * (bodies[..., None] * centers[:, :, None]).sum(dim=1) - seen.positions
+        statics = (_take(values, static_index) for values in (current.positions, current.normals))
+        return nearest_static_contacts(mirrored, *statics, static_mask, self.contact_reach).distances > 0
 
     def forward(
         self, previous: Particles, current: Particles, memory: Any, keys: RandomKeys, rollout_step: int
@@ -198,58 +218,110 @@ class InertialDynamics(AbstractDynamics):
 
     def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
         positions = _take(current.positions, memory.index)
-        twists = self._carried_twists(positions, memory)
-        probes = slice(0, self.num_probes)
         static_positions = _take(current.positions, memory.static_index)
-        contacts = nearest_static_contacts(
-            positions[:, probes],
-            static_positions,
-            _take(current.normals, memory.static_index),  # type: ignore[arg-type]
-            memory.static_mask,
-            self.contact_reach,
+        resolved = self._resolved(positions, static_positions, current.normals, memory)  # type: ignore[arg-type]
+        step, onward = self._rested(resolved)
+        moved = step.centers[:, :, None] + step.displacements[:, :, None]
+        moved = moved + step.turned(positions[:, None] - step.centers[:, :, None])
+        owned = memory.bodies[..., None]
+        following = torch.where(memory.mask[..., None], (owned * moved).sum(dim=1), positions)
+        rotations = rotation_from_spin(step.spins)
+        turned = (owned * rotate(rotations[:, :, None], memory.normals[:, None])).sum(dim=1)
+        all_positions = _put(current.positions, memory.index, following, memory.mask)
+        features = self._shade(current, memory, static_positions, following, turned)
+        stretches, _ = step.following_stretches()
+        _, strains = onward.following_stretches()
+        onward = BodyMotion(step.centers + step.displacements, onward.displacements, onward.spins, stretches, strains)
+        memory = replace(memory, motion=onward, normals=turned)
+        return replace(current, positions=all_positions, features=features), memory
+
+    def _resolved(
+        self, positions: Tensor, static_positions: Tensor, normals: Tensor, memory: InertialMemory
+    ) -> Resolved:
+        """Return the step after forces, elastic return and contact."""
+        probes = slice(0, self.num_probes)
+        probe_positions, members = positions[:, probes], memory.bodies[:, :, probes]
+        materials = memory.materials
+        shares = memory.bodies / memory.bodies.sum(dim=-1, keepdim=True).clamp(min=1)
+        inertia = body_inertia(
+            positions, memory.motion.centers, shares, materials.softness, self.log_inertia_ratio.exp()
         )
-        # Mass inside a body is not where its surface particles are: one learned factor on their inverse inertia.
-        inverse_inertia = invert_inertia(positions, memory.centers, memory.body_weights) * self.log_inertia_ratio.exp()
-        weights = memory.fit_weights[:, :, probes]
-        twists = self.forces(
-            positions[:, probes],
-            memory.displacements[:, probes],
+        offsets = probe_positions[:, None] - memory.motion.centers[:, :, None]
+        moved = memory.motion.displacements[:, :, None] + memory.motion.turned(offsets) - offsets
+        statics = (static_positions, _take(normals, memory.static_index), memory.static_mask, self.contact_reach)
+        contacts = nearest_static_contacts(probe_positions, *statics)
+        motion = self.forces(
+            probe_positions,
+            (members[..., None] * moved).sum(dim=1),
             contacts,
             memory.mask[:, probes],
-            weights,
-            twists,
-            inverse_inertia,
+            members,
+            memory.motion,
+            inertia,
         )
-        twists = resolve_contacts(
-            twists,
-            positions[:, probes],
+        motion = replace(motion, strains=_elastic(motion, materials))
+        points = self._contact_points(probe_positions, memory, members)
+        if self.mirror_hidden:
+            contacts = nearest_static_contacts(points.positions, *statics)
+        solver = ContactSolver(
+            points=points,
+            inertia=inertia,
+            materials=materials,
+            masses=memory.masses,
+            rest_speed=self.log_rest_speed.exp(),
+        )
+        return solver.resolve(
+            motion,
             contacts,
-            memory.mask[:, None, probes] & (weights > 1e-3 * weights.amax(dim=-1, keepdim=True)),
-            inverse_inertia,
-            self.log_friction.exp(),
+            self._between(points, memory),
             num_iterations=self.num_contact_iterations,
             max_depth=self.max_contact_depth,
         )
-        following = _apply_twists(positions, twists, memory.blend_weights)
-        following = torch.where(memory.mask[..., None], following, positions)
-        rotations = rotation_from_spin(torch.einsum("bap,bac->bpc", memory.blend_weights, twists.spins))
-        turned = rotate(rotations, memory.normals)
-        all_positions = _put(current.positions, memory.index, following, memory.mask)
-        features = self._shade(current, memory, static_positions, following, turned)
-        memory = replace(
-            memory,
-            displacements=following - positions,
-            normals=turned,
-            centers=twists.centers + twists.displacements,
-            center_displacements=twists.displacements,
+
+    def _contact_points(self, positions: Tensor, memory: InertialMemory, members: Tensor) -> ContactPoints:
+        """Return what may touch: the probes and, where their hidden sides are to be guessed, their mirror images.
+
+        Cameras above a body do not see what it will land on. Most bodies are alike on both sides of their centre.
+        """
+        normals = memory.normals[:, : self.num_probes]
+        if not self.mirror_hidden:
+            return ContactPoints(positions, normals, members)
+        centers = (members[..., None] * memory.motion.centers[:, :, None]).sum(dim=1)
+        mirrored = members * memory.mirrored[:, None, : self.num_probes]
+        return ContactPoints(
+            torch.cat([positions, 2 * centers - positions], dim=1),
+            torch.cat([normals, -normals], dim=1),
+            torch.cat([members, mirrored.to(members.dtype)], dim=2),
         )
-        return replace(current, positions=all_positions, features=features), memory
 
     @staticmethod
-    def _carried_twists(positions: Tensor, memory: InertialMemory) -> Twists:
-        """Continue the last displacement in free motion: the body's centre moves straight, the spin stays."""
-        fitted = fit_twists(positions, memory.displacements, memory.fit_weights)
-        return Twists(memory.centers, memory.center_displacements, fitted.spins)
+    def _between(points: ContactPoints, memory: InertialMemory) -> BodyContacts | None:
+        """Return where bodies may touch each other; None where there is nothing to touch, which saves the work."""
+        if points.members.shape[1] == 1:
+            return None
+        # No deeper than a third of a body: what lies deeper came from the other side.
+        size = (memory.masses / memory.materials.density).detach().clamp(min=1e-27) ** (1 / 3)
+        depth = (points.members * size).sum(dim=1) / 3
+        found = nearest_body_contacts(points, _PAIR_REACH * memory.spacing, depth)
+        return found if bool(found.known.any()) else None
+
+    def _rested(self, resolved: Resolved) -> tuple[BodyMotion, BodyMotion]:
+        """Stop what touches something and moves by less than a fraction of what a force does in a step.
+
+        Networks are never exactly zero, and a body at rest would creep; as static friction, this lets only what is
+        strong enough move it.
+        """
+        slowest = self.rest_share * self.force_scale
+        if slowest == 0:
+            return resolved.step, resolved.onward
+        gated = []
+        for motion in (resolved.step, resolved.onward):
+            # A turn counts by how far it moves what is a contact range away, which is of a body's size.
+            square = motion.displacements.square().sum(dim=-1, keepdim=True)
+            square = square + (0.2 * self.contact_range) ** 2 * motion.spins.square().sum(dim=-1, keepdim=True)
+            share = torch.where(resolved.touching, square / (square + slowest**2), 1.0)
+            gated.append(replace(motion, displacements=motion.displacements * share, spins=motion.spins * share))
+        return gated[0], gated[1]
 
     def _shade(
         self, current: Particles, memory: InertialMemory, static_positions: Tensor, following: Tensor, turned: Tensor
@@ -262,6 +334,47 @@ class InertialDynamics(AbstractDynamics):
         static = static + self.static_shading(static, memory.static_surroundings, surroundings)
         features = _put(current.features, memory.index, moving, memory.mask)
         return _put(features, memory.static_index, static, memory.static_mask)
+
+
+def _surfels(particles: Particles, index: Tensor, mask: Tensor) -> Surfels:
+    colors, normals = particles.colors, particles.normals
+    assert colors is not None and normals is not None
+    taken = [_take(values, index) for values in (particles.positions, colors, normals, particles.features)]
+    return Surfels(*taken, mask)
+
+
+def _first_motion(positions: Tensor, displacements: Tensor, shares: Tensor, centers: Tensor) -> BodyMotion:
+    """Return the motion that the bodies arrived with: rigid, about their own centres."""
+    fitted = fit_twists(positions, displacements, shares)
+    # Fitted centres are those after the step, so the way back tells where each centre came from.
+    back = rotate(rotation_from_spin(-fitted.spins), centers - fitted.centers)
+    eye = torch.eye(3, dtype=positions.dtype, device=positions.device).expand(*centers.shape, 3)
+    there = (shares.sum(dim=-1) > 0)[..., None]
+    return BodyMotion(
+        centers=centers,
+        displacements=torch.where(there, centers - (fitted.centers - fitted.displacements + back), 0.0),
+        spins=torch.where(there, fitted.spins, 0.0),
+        stretches=eye,
+        strains=torch.zeros_like(eye),
+    )
+
+
+def _volumes(positions: Tensor, centers: Tensor, shares: Tensor) -> Float[Tensor, "batch body 1"]:
+    """Return the cube of each body's root mean square radius, to which its volume is in proportion (cubic metres).
+
+    A place without a body gets 1: masses are divided by.
+    """
+    offsets = positions[:, None] - centers[:, :, None]
+    square = (shares * offsets.square().sum(dim=-1)).sum(dim=-1, keepdim=True)
+    there = shares.sum(dim=-1, keepdim=True) > 0
+    return torch.where(there, square.clamp(min=1e-18), 1.0) ** 1.5
+
+
+def _elastic(motion: BodyMotion, materials: Materials) -> Float[Tensor, "batch body 3 3"]:
+    """Return the strains of a damped oscillation about the first shape; one semi-implicit step, stable for any."""
+    eye = torch.eye(3, dtype=motion.strains.dtype, device=motion.strains.device)
+    carried = motion.strains * (1 - materials.damping)[..., None]
+    return carried - materials.stiffness[..., None] * (motion.stretches - eye)
 
 
 def _with_a_slot(particles: Particles) -> Particles:
@@ -288,27 +401,3 @@ def _put(values: Tensor, index: Tensor, new: Tensor, mask: Tensor) -> Tensor:
     """Return ``values`` with ``new`` at the valid slots; the others keep what they had, bit for bit."""
     new = torch.where(mask[..., None], new, _take(values, index))
     return values.scatter(1, index[..., None].expand_as(new), new)
-
-
-def _normalize(weights: Tensor, dim: int) -> Tensor:
-    return weights / weights.sum(dim=dim, keepdim=True).clamp(min=1e-12)
-
-
-def _reverse(twists: Twists) -> Twists:
-    """Return the motion back: fitted centres are those after the step."""
-    return replace(twists, displacements=-twists.displacements, spins=-twists.spins)
-
-
-def _apply_each(points: Float[Tensor, "batch anchor 3"], twists: Twists) -> Float[Tensor, "batch anchor 3"]:
-    """Move one point with each anchor."""
-    turned = rotate(rotation_from_spin(twists.spins), points - twists.centers)
-    return twists.centers + twists.displacements + turned
-
-
-def _apply_twists(
-    positions: Float[Tensor, "batch particle 3"], twists: Twists, blend: Float[Tensor, "batch anchor particle"]
-) -> Float[Tensor, "batch particle 3"]:
-    rotations = rotation_from_spin(twists.spins)
-    offsets = positions[:, None] - twists.centers[:, :, None]
-    moved = (twists.centers + twists.displacements)[:, :, None] + rotate(rotations[:, :, None], offsets)
-    return (blend[..., None] * moved).sum(dim=1)

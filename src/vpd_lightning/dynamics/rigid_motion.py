@@ -1,6 +1,5 @@
 """Rigid motions of weighted point sets: closed-form fits, applied and estimated without correspondences."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -136,63 +135,15 @@ def anchor_weights(
     return (torch.exp(-square / (2 * radius**2)) + 1e-6) * mask[:, None]
 
 
-@torch.no_grad()
-def match_locally_rigid(
-    positions: Float[Tensor, "batch particle 3"],
-    colors: Float[Tensor, "batch particle 3"],
-    mask: Bool[Tensor, "batch particle"],
-    target_positions: Float[Tensor, "batch target 3"],
-    target_colors: Float[Tensor, "batch target 3"],
-    target_mask: Bool[Tensor, "batch target"],
-    *,
-    num_anchors: int,
-    radius: float,
-    match_scales: Sequence[float],
-    color_scale: float,
-) -> Float[Tensor, "batch particle 3"]:
-    """Find where each particle was in the target frame, without correspondences (metres).
+def rigid_fit(
+    source: Float[Tensor, "batch particle 3"],
+    goal: Float[Tensor, "batch particle 3"],
+    weights: Float[Tensor, "batch anchor particle"],
+) -> tuple[Float[Tensor, "batch anchor 3 3"], Float[Tensor, "batch anchor 3"], Float[Tensor, "batch anchor 3"]]:
+    """Fit rotation and centres of source -> goal for each anchor (Kabsch 1976), in float64 for the SVD.
 
-    Soft matches in space and colour, annealed from ``match_scales[0]`` to the last (metres); after each round a
-    weighted rigid fit (Kabsch) per anchor replaces the matches by their locally rigid consensus. Single matches fail
-    on faces of one colour (the aperture problem); agreement on a rotation resolves them. Colours are compared as
-    chromaticity and, more weakly, brightness, so that shading under rotation does not break a match.
+    Returns (rotation, source centre, goal centre): a point x goes to rotation (x - source centre) + goal centre.
     """
-    features, target_features = _chromaticity(colors), _chromaticity(target_colors)
-    color_cost = (features[:, :, None] - target_features[:, None]).square().sum(dim=-1) / (2 * color_scale**2)
-    color_cost = color_cost.masked_fill(~target_mask[:, None], float("inf"))
-    anchors = farthest_points(positions, mask, num_anchors)
-    affinity = anchor_weights(anchors, positions, mask, radius)
-    share = affinity / affinity.sum(dim=1, keepdim=True).clamp(min=1e-12)
-    moved = positions + (_masked_mean(target_positions, target_mask) - _masked_mean(positions, mask))[:, None]
-    origin = _masked_mean(target_positions, target_mask)[:, None]
-    goal_square = (target_positions - origin).square().sum(dim=-1)[:, None]
-    for scale in match_scales:
-        # The product form of the squared distance keeps its digits here: both sets are centred on a body's size.
-        local = moved - origin
-        square = local.square().sum(dim=-1)[..., None] + goal_square - 2 * local @ (target_positions - origin).mT
-        logits = -square.clamp(min=0) / (2 * scale**2) - color_cost
-        top = logits.amax(dim=-1, keepdim=True).clamp(min=-80.0)
-        kernel = torch.exp(logits - top)
-        total = kernel.sum(dim=-1, keepdim=True).clamp(min=1e-12)
-        matches = (kernel @ target_positions) / total
-        evidence = (total * torch.exp(top)).squeeze(-1)
-        weights = affinity * (evidence / (evidence + 0.3))[:, None]
-        rotation, center, goal = _kabsch(positions, matches, weights)
-        candidates = rotate(rotation[:, :, None], positions[:, None] - center[:, :, None]) + goal[:, :, None]
-        moved = (share[..., None] * candidates).sum(dim=1)
-    return torch.where(mask[..., None], moved, positions)
-
-
-def _chromaticity(colors: Tensor) -> Tensor:
-    return torch.cat([colors / (colors.sum(dim=-1, keepdim=True) + 0.15), 0.3 * colors], dim=-1)
-
-
-def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    return (values * mask[..., None]).sum(dim=1) / mask.sum(dim=1, keepdim=True).clamp(min=1)
-
-
-def _kabsch(source: Tensor, goal: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit rotation and centres of source -> goal for each anchor (Kabsch 1976), in float64 for the SVD."""
     weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-12)
     source_center, goal_center = weighted_sum(weights, source), weighted_sum(weights, goal)
     a = source[:, None] - source_center[:, :, None]

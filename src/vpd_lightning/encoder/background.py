@@ -2,13 +2,14 @@
 
 import torch
 from jaxtyping import Bool, Float, UInt8
-from torch import Tensor, nn
+from torch import Tensor
 
+from vpd_lightning.encoder.base import AbstractBackground
 from vpd_lightning.errors import DataError
 from vpd_lightning.types import Cameras, RGBDFrames
 
 
-class BackgroundModel(nn.Module):
+class BackgroundModel(AbstractBackground):
     """Marks pixels that lie nearer than the training-median depth of the same camera.
 
     Uses no labels, but fixed cameras. Depth, unlike colour, tells bodies from their shadows. The median images live in
@@ -16,6 +17,8 @@ class BackgroundModel(nn.Module):
     """
 
     # Paper: not in the paper; it gives the inertial dynamics its candidates for motion.
+
+    needs_fit = True
 
     def __init__(self, *, num_views: int, height: int, width: int, depth_threshold: float):
         super().__init__()

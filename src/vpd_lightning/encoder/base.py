@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from vpd_lightning.randomness import RandomKeys
@@ -17,11 +18,24 @@ class EncoderOutput:
     auxiliary: dict[str, Tensor] = field(default_factory=dict)
 
 
+class AbstractBackground(nn.Module, ABC):
+    """Tells what stands still in the frames of one time step from what may move.
+
+    Where ``needs_fit``, training calls ``fit(rgb, depth, cameras)`` with the median images of fixed cameras first.
+    """
+
+    needs_fit = False
+
+    @abstractmethod
+    def forward(self, frames: RGBDFrames) -> Bool[Tensor, "batch view height width"]:
+        """Return which pixels may be moving."""
+
+
 class AbstractEncoder(nn.Module, ABC):
     """Turns the RGB-D frames of one time step (axes ``batch view``) into particles."""
 
     # A default here would hide the submodule: class attributes win over nn.Module's registry.
-    background: nn.Module | None
+    background: AbstractBackground | None
 
     @abstractmethod
     def forward(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> EncoderOutput:

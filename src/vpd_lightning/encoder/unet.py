@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vpd_lightning.encoder.background import BackgroundModel
-from vpd_lightning.encoder.base import EncoderOutput
+from vpd_lightning.encoder.base import AbstractBackground, EncoderOutput
 from vpd_lightning.encoder.unet_network import UNetNetwork
 from vpd_lightning.encoder.unprojection import UnprojectingEncoder
 from vpd_lightning.randomness import RandomKeys
@@ -33,7 +32,7 @@ class UNetEncoder(UnprojectingEncoder):
         workspace_min: Sequence[float],
         workspace_max: Sequence[float],
         moving_fraction: float | None,
-        background: BackgroundModel | None,
+        background: AbstractBackground | None,
         use_normals: bool,
     ):
         super().__init__(

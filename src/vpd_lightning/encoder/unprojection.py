@@ -1,13 +1,13 @@
 """From pixels with a depth to particles: unproject, crop to the workspace, subsample (paper section 3.1)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from vpd_lightning.encoder.background import BackgroundModel
-from vpd_lightning.encoder.base import AbstractEncoder
+from vpd_lightning.encoder.base import AbstractBackground, AbstractEncoder
 from vpd_lightning.errors import EmptyWorkspaceError
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.geometry.normals import depth_normals
@@ -37,7 +37,7 @@ class UnprojectingEncoder(AbstractEncoder):
         workspace_min: Sequence[float],
         workspace_max: Sequence[float],
         moving_fraction: float | None,
-        background: BackgroundModel | None,
+        background: AbstractBackground | None,
         use_normals: bool,
     ):
         super().__init__()
@@ -92,7 +92,8 @@ class UnprojectingEncoder(AbstractEncoder):
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
         moving = None
         if self.background is not None:
-            moving, border = (pixels.flatten(1) for pixels in _with_border(self.background(frames)))
+            loose = self.background(_cropped(frames, candidates))
+            moving, border = (pixels.flatten(1) for pixels in _with_border(loose))
             candidates = candidates & ~border
         index, valid = self._choose(candidates, moving, keys, purpose)
 
@@ -132,6 +133,12 @@ class UnprojectingEncoder(AbstractEncoder):
             indices.append(index)
             valids.append(valid)
         return torch.stack(indices), torch.stack(valids)
+
+
+def _cropped(frames: RGBDFrames, candidates: Bool[Tensor, "batch point"]) -> RGBDFrames:
+    """Return the frames with depth at the candidates only: how wide a floor is must not depend on the horizon."""
+    kept = candidates.view_as(frames.depth)
+    return replace(frames, depth=torch.where(kept, frames.depth, 0.0))
 
 
 def _with_border(moving: Bool[Tensor, "batch view height width"]) -> tuple[Tensor, Tensor]:

@@ -40,7 +40,7 @@ class EncoderContract(Contract):
     def built(self, dtype: torch.dtype = torch.float64) -> AbstractEncoder:
         """Return an encoder in evaluation mode, its background model fitted."""
         encoder = super().built(dtype)
-        if encoder.background is not None:
+        if encoder.background is not None and encoder.background.needs_fit:
             still = ball_frames(1, has_ball=False).to(self.device)[0]
             encoder.background.fit(still.rgb, still.depth.to(dtype), still.cameras.to(dtype))
         return encoder

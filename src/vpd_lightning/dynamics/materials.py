@@ -1,0 +1,66 @@
+"""What each body is made of, inferred from its particles' features: how it slides, bounces, weighs and deforms."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Materials:
+    """What a body is made of.
+
+    Coulomb ``friction``; ``restitution`` (share of the normal speed kept in an impact, 0 to 1);
+    ``density`` relative to other bodies; ``softness`` (0 to 1: how much a push stretches); ``stiffness`` (the squared
+    angular frequency of its elastic return, per step squared, below 1); ``damping`` of it (share per step, 0 to 1).
+    """
+
+    friction: Float[Tensor, "batch body 1"]
+    restitution: Float[Tensor, "batch body 1"]
+    density: Float[Tensor, "batch body 1"]
+    softness: Float[Tensor, "batch body 1"]
+    stiffness: Float[Tensor, "batch body 1"]
+    damping: Float[Tensor, "batch body 1"]
+
+
+class MaterialNetwork(nn.Module):
+    """A small network on the mean features of a body; before training all bodies are alike, and nearly rigid.
+
+    The same numbers are inferred for the same features, so one model holds rigid and soft bodies.
+    """
+
+    def __init__(self, *, feature_dim: int, hidden_dim: int, is_soft: bool):
+        super().__init__()
+        self.is_soft = is_soft
+        self.network = nn.Sequential(
+            nn.LayerNorm(feature_dim), nn.Linear(feature_dim, hidden_dim), nn.SiLU(), nn.Linear(hidden_dim, 6)
+        )
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        with torch.no_grad():
+            # friction 0.5, restitution 0.1, density 1, softness 0.1, stiffness 0.25, damping 0.1
+            start = [math.log(0.5), _logit(0.1), 0.0, _logit(0.1), _logit(0.25), _logit(0.1)]
+            last.bias.copy_(torch.tensor(start))
+
+    def forward(
+        self, features: Float[Tensor, "batch particle feature"], weights: Float[Tensor, "batch body particle"]
+    ) -> Materials:
+        """Return the materials; ``weights`` sum to one over the particles of a body."""
+        mean = torch.einsum("bkp,bpf->bkf", weights, features)
+        friction, restitution, density, softness, stiffness, damping = self.network(mean).split(1, dim=-1)
+        softness = torch.sigmoid(softness) if self.is_soft else torch.zeros_like(softness)
+        return Materials(
+            friction=torch.exp(friction.clamp(-5, 2)),
+            restitution=torch.sigmoid(restitution),
+            density=torch.exp(density.clamp(-3, 3)),
+            softness=softness,
+            stiffness=torch.sigmoid(stiffness),
+            damping=torch.sigmoid(damping),
+        )
+
+
+def _logit(share: float) -> float:
+    return math.log(share / (1 - share))

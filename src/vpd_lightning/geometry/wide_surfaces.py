@@ -1,0 +1,87 @@
+"""Which pixels belong to wide smooth surfaces (floor, walls, table tops): what stands still in most scenes."""
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+_NUM_TANGENT_PLANES = 4
+"""Nearest points of a wide surface whose tangent planes a doubtful point is held against."""
+
+_MAX_SURFACE_POINTS = 6000
+"""A wide surface is flat where it is held against; this many of its points are enough and keep the search cheap."""
+
+
+def wide_surfaces(
+    points: Float64[np.ndarray, "view height width 3"],
+    normals: Float64[np.ndarray, "view height width 3"],
+    valid: Bool[np.ndarray, "view height width"],
+    footprints: Float64[np.ndarray, "view height width"],
+    *,
+    max_slope: float,
+    max_turn: float,
+    min_width: float,
+    tolerance: float,
+) -> Bool[np.ndarray, "view height width"]:
+    """Return which valid pixels lie on a surface that is smooth and wide.
+
+    Neighbouring pixels are of one surface where the step between their points leaves both tangent planes by no more
+    than ``max_slope`` of its length and their normals differ by no more than ``max_turn`` (a cosine). A surface is wide
+    where the diagonal of its bounding box is at least ``min_width`` of that of all valid points. What is left over
+    belongs to it, too, if its point lies within ``tolerance`` footprints (metres that a pixel covers) of the tangent
+    plane of a near point of it, from whatever view: image borders, and the seam at the foot of a body.
+
+    One time step is enough, cameras may move, and nothing is said of directions: a wall is as good as a floor.
+    """
+    shape = valid.shape
+    index = np.arange(valid.size).reshape(shape)
+    flat, flat_normals, flat_valid = points.reshape(-1, 3), normals.reshape(-1, 3), valid.reshape(-1)
+    senders = np.concatenate([index[:, :, :-1].ravel(), index[:, :-1].ravel()])
+    receivers = np.concatenate([index[:, :, 1:].ravel(), index[:, 1:].ravel()])
+    usable = flat_valid[senders] & flat_valid[receivers]
+    senders, receivers = senders[usable], receivers[usable]
+    steps = flat[receivers] - flat[senders]
+    lengths = np.sqrt((steps**2).sum(axis=-1))
+    smooth = (flat_normals[senders] * flat_normals[receivers]).sum(axis=-1) > max_turn
+    for end in (senders, receivers):
+        smooth &= np.abs((flat_normals[end] * steps).sum(axis=-1)) < max_slope * lengths
+    links = coo_array((np.ones(smooth.sum(), bool), (senders[smooth], receivers[smooth])), shape=(valid.size,) * 2)
+    _, labels = connected_components(links, directed=False)
+    wide = _is_wide(flat, flat_valid, labels, min_width)
+    doubtful = flat_valid & ~wide
+    if wide.any() and doubtful.any():
+        wide[doubtful] = _on_planes(flat, flat_normals, wide, doubtful, footprints.reshape(-1), tolerance)
+    return wide.reshape(shape)
+
+
+def _is_wide(points: np.ndarray, valid: np.ndarray, labels: np.ndarray, min_width: float) -> Bool[np.ndarray, " point"]:
+    """Mark the points whose surface reaches far enough."""
+    if not valid.any():
+        return np.zeros_like(valid)
+    seen = points[valid]
+    whole = np.linalg.norm(seen.max(axis=0) - seen.min(axis=0))
+    order = np.argsort(labels[valid], kind="stable")
+    grouped, names = seen[order], labels[valid][order]
+    starts = np.flatnonzero(np.r_[True, names[1:] != names[:-1]])
+    extent = np.maximum.reduceat(grouped, starts) - np.minimum.reduceat(grouped, starts)
+    is_wide = np.zeros(labels.max() + 1, dtype=bool)
+    is_wide[names[starts]] = np.linalg.norm(extent, axis=-1) >= max(min_width * whole, np.finfo(float).tiny)
+    return is_wide[labels] & valid
+
+
+def _on_planes(
+    points: np.ndarray,
+    normals: np.ndarray,
+    wide: np.ndarray,
+    doubtful: np.ndarray,
+    footprints: np.ndarray,
+    tolerance: float,
+) -> Bool[np.ndarray, " doubtful"]:
+    surface = np.flatnonzero(wide)
+    surface = surface[:: max(1, len(surface) // _MAX_SURFACE_POINTS)]
+    count = min(_NUM_TANGENT_PLANES, len(surface))
+    _, near = cKDTree(points[surface]).query(points[doubtful], k=[*range(1, count + 1)])
+    near = surface[near]
+    heights = ((points[doubtful][:, None] - points[near]) * normals[near]).sum(axis=-1)
+    return np.abs(heights).min(axis=1) < tolerance * footprints[doubtful]

@@ -1,0 +1,93 @@
+"""Which particles hang together as one body: islands of convexly connected particles."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+_SPACING_RANK = 4
+"""The distance to this many-th nearest particle is what is called spacing: one missing neighbour hardly changes it."""
+
+_MIN_PARTICLES, _MIN_SHARE = 8, 0.0125
+"""An island of fewer particles is no body. One of a smaller share of all is one only if no other island is near."""
+
+
+@torch.no_grad()
+def label_bodies(
+    positions: Float[Tensor, "batch particle 3"],
+    normals: Float[Tensor, "batch particle 3"],
+    mask: Bool[Tensor, "batch particle"],
+    *,
+    num_bodies: int,
+    link: float,
+    max_concavity: float,
+    max_concave_share: float,
+) -> Int64[Tensor, "batch particle"]:
+    """Return the body of each particle, from 0 (the one with most particles) on; -1 where ``mask`` is false.
+
+    Two particles are linked where they lie within ``link`` spacings of each other and the surface between them is not
+    hollow: (n_i - n_j) . (x_i - x_j) / |x_i - x_j| is at least ``-max_concavity`` (after the convexity criterion of
+    Stein et al. 2014, "Object partitioning using local convexity"). Bodies that touch meet in a hollow. A particle with
+    more than ``max_concave_share`` of hollow pairs links with none: in a touch there may be a single pair that is not.
+    What is in no island of some size, and islands beyond ``num_bodies``, joins the nearest body. Scene by scene, on
+    the CPU; the numbers do not depend on the order of the particles, on the place of the world or its scale.
+    """
+    labels = torch.full(mask.shape, -1, dtype=torch.int64)
+    for member, own in enumerate(mask.cpu()):
+        if bool(own.any()):
+            where = own.nonzero().flatten()
+            points, directions = (
+                values[member].detach().to("cpu", torch.float64)[where].numpy() for values in (positions, normals)
+            )
+            found = _label(points, directions, num_bodies, link, max_concavity, max_concave_share)
+            labels[member, where] = torch.from_numpy(found)
+    return labels.to(mask.device)
+
+
+def _label(
+    points: np.ndarray,
+    normals: np.ndarray,
+    num_bodies: int,
+    link: float,
+    max_concavity: float,
+    max_concave_share: float,
+) -> np.ndarray:
+    count = len(points)
+    tree = cKDTree(points)
+    rank = min(_SPACING_RANK, count - 1)
+    if rank < 1:
+        return np.zeros(count, dtype=np.int64)
+    spacing = np.median(tree.query(points, k=[rank + 1])[0])
+    senders, receivers = tree.query_pairs(link * spacing * (1 + 1e-9), output_type="ndarray").T
+    steps = points[senders] - points[receivers]
+    lengths = np.sqrt((steps**2).sum(axis=-1)).clip(min=np.finfo(float).tiny)
+    turn = ((normals[senders] - normals[receivers]) * steps).sum(axis=-1) / lengths
+    known = (normals**2).sum(axis=-1) > 0.5
+    smooth = known[senders] & known[receivers] & (turn > -max_concavity)
+
+    pairs = np.bincount(np.r_[senders, receivers], minlength=count)
+    hollow = np.bincount(np.r_[senders[~smooth], receivers[~smooth]], minlength=count)
+    clean = hollow <= max_concave_share * pairs
+    smooth &= clean[senders] & clean[receivers]
+    links = coo_array((np.ones(smooth.sum(), bool), (senders[smooth], receivers[smooth])), shape=(count, count))
+    _, islands = connected_components(links, directed=False)
+
+    sizes = np.bincount(islands)
+    centers = np.stack([np.bincount(islands, points[:, axis]) for axis in range(3)], axis=-1) / sizes[:, None]
+    order = np.lexsort([*centers.T, -sizes])  # by size, then by place: the order of the particles must not matter
+    near_others = np.zeros(len(sizes), dtype=bool)
+    near_others[islands[np.r_[senders, receivers][np.tile(islands[senders] != islands[receivers], 2)]]] = True
+    enough = np.where(near_others, max(_MIN_PARTICLES, _MIN_SHARE * count), _MIN_PARTICLES)
+    large = [island for island in order[:num_bodies] if sizes[island] >= enough[island]] or [order[0]]
+    number = np.full(len(sizes), -1, dtype=np.int64)
+    number[large] = np.arange(len(large))
+    labels = number[islands]
+    stray = labels < 0
+    if stray.any():
+        kept = np.flatnonzero(~stray)
+        _, nearest = cKDTree(points[kept]).query(points[stray])
+        labels[stray] = labels[kept[nearest]]
+    return labels
