@@ -13,8 +13,9 @@ from benchmarks.results_files import read
 from tests.benchmarks.test_plots import is_picture
 from vpd_lightning.commands import train
 
+pytestmark = pytest.mark.slow  # two trainings of two steps
 CPU = torch.device("cpu")
-TWO_OF_THREE = ["scene.input_views=[0,1]", "data.target_views=[0,1]", "encoder.background.num_views=2"]
+TWO_OF_THREE = ["scene.input_views=[0,1]", "data.target_views=[0,1]"]
 
 
 @pytest.fixture(scope="module")
