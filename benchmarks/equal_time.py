@@ -83,7 +83,7 @@ def frame_seconds(model: Model, repeats: int, share: float) -> list[float]:
 def measure(folders: Sequence[Path], repeats: int, num_clips: int, num_rays: int, horizons: Sequence[int]) -> Result:
     """Measure all runs; rows hold the time of a frame, the PSNR and, in the note, how long the run was trained."""
     rows: list[Row] = []
-    facts = {}
+    facts: dict[str, float] = {}
     baseline: tuple[str, list[float]] = ("", [])
     psnrs: dict[str, dict[str, Tensor]] = {}
     for folder in folders:
