@@ -25,6 +25,17 @@ class Point:
     is_default: bool = False
 
 
+@dataclass(frozen=True)
+class Mark:
+    """A trained model in a plot of quality over time: PSNR in dB, and its standard error; ``kind`` says of what."""
+
+    name: str
+    kind: str
+    seconds: float
+    psnr: float
+    spread: float
+
+
 def pareto_front(points: Sequence[Point]) -> list[Point]:
     """Return the points that no other point beats in both time and error, from fast to slow."""
     front: list[Point] = []
@@ -117,6 +128,35 @@ def time_error(panels: Mapping[str, Mapping[str, Sequence[Point]]], path: Path) 
         handles, labels = left.get_legend_handles_labels()
         right.legend(handles, labels, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9, frameon=False)
     _finish(figure, grid.ravel(), path)
+
+
+def quality_over_time(marks: Sequence[Mark], title: str, path: Path) -> None:
+    """Draw PSNR over the time of a frame; a colour per name, an outline instead of a disc per kind behind the first."""
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(figsize=(8, 5), layout="constrained")
+    names, kinds = (list(dict.fromkeys(values)) for values in ([m.name for m in marks], [m.kind for m in marks]))
+    for mark in marks:
+        color = COLORS[names.index(mark.name) % len(COLORS)]
+        number = kinds.index(mark.kind)
+        style = {"color": color, "ms": 10, "mfc": "white" if number else color, "mew": 2, "capsize": 4}
+        axes.errorbar(
+            [1000 * mark.seconds], [mark.psnr], yerr=[mark.spread], fmt=MARKERS[number % len(MARKERS)], **style
+        )
+        if number == 0:
+            words = {"xytext": (11, 6), "textcoords": "offset points", "fontsize": 10, "color": color}
+            axes.annotate(mark.name, (1000 * mark.seconds, mark.psnr), **words)
+    for number, kind in enumerate(kinds if len(kinds) > 1 else []):
+        face = {"mfc": "white" if number else INK, "color": INK}
+        axes.plot([], [], MARKERS[number % len(MARKERS)], label=kind, ms=9, mew=2, **face)
+    if len(kinds) > 1:
+        axes.legend(fontsize=9, frameon=False)
+    axes.set_xscale("log")
+    _plain_numbers(axes.xaxis)
+    axes.margins(x=0.25, y=0.15)
+    axes.set_xlabel("time of a frame, milliseconds")
+    axes.set_ylabel("PSNR to the recording, dB")
+    axes.set_title(title, fontsize=11, loc="left")
+    _finish(figure, [axes], path)
 
 
 def scaling(curves: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]], path: Path) -> None:

@@ -47,22 +47,28 @@ def run(options: Options) -> Result:
 
 
 def view_of(
-    model: Model, num_rays: int, device: torch.device, horizons: Sequence[int] = HORIZONS, trajectory: int = 0
+    model: Model,
+    num_rays: int,
+    device: torch.device,
+    horizons: Sequence[int] = HORIZONS,
+    trajectory: int = 0,
+    cameras: Sequence[int] | None = None,
 ) -> View:
-    """Predict one test clip and choose pixels of all its cameras."""
+    """Predict one test clip and choose pixels of ``cameras``, or of all."""
     clip = model.clip(max(horizons), trajectory)
     views = model.input_views
-    cameras = clip.cameras[:, views]
-    scene = model.simulator.encode(clip.rgb[:, views].to(device), clip.depth[:, views].to(device), cameras.to(device))
+    inputs = clip.cameras[:, views].to(device)
+    scene = model.simulator.encode(clip.rgb[:, views].to(device), clip.depth[:, views].to(device), inputs)
     states = model.simulator.rollout(scene, max(horizons))
+    shown = list(range(clip.target_rgb.shape[1])) if cameras is None else list(cameras)
     generator = torch.Generator().manual_seed(0)
     origins, directions, colors = [], [], []
     for horizon in horizons:
-        rays = pixel_rays(clip.target_cameras[horizon - 1])
+        rays = pixel_rays(clip.target_cameras[horizon - 1][shown])
         chosen = torch.randint(0, rays.origins[..., 0].numel(), (num_rays,), generator=generator)
         origins.append(rays.origins.reshape(-1, 3)[chosen])
         directions.append(rays.directions.reshape(-1, 3)[chosen])
-        colors.append(clip.target_rgb[horizon - 1].reshape(-1, 3)[chosen].float() / 255)
+        colors.append(clip.target_rgb[horizon - 1][shown].reshape(-1, 3)[chosen].float() / 255)
     kept = [states[horizon - 1] for horizon in horizons]
     particles = Particles(
         *(torch.cat([getattr(state, key) for state in kept]) for key in ("positions", "features", "mask"))

@@ -147,6 +147,14 @@ def test_every_number_of_the_text_stands_in_the_configuration(experiment, place:
     assert at(config, place) == TEXT[place]
 
 
+def test_lengths_of_the_splat_renderer_follow_the_scene(experiment):
+    name, _ = experiment
+    config = compose("train", [f"experiment={name}", "renderer=splat", "scene.surface_scale=0.7"])
+
+    assert config["renderer"]["surface_scale"] == 0.7
+    assert config["renderer"]["near"] == config["scene"]["near"]
+
+
 def test_evaluation_follows_the_protocol(experiment):
     _, config = experiment
 

@@ -1,3 +1,4 @@
+from dataclasses import astuple
 from importlib.util import find_spec
 from itertools import product
 
@@ -34,8 +35,8 @@ def scores_by_loop(position, valid, origin, direction, score):
         pairs.append((along, sum((p[i] - o[i] - along * d[i]) ** 2 for i in range(3))))
     if isinstance(score, BesideRay):
         return [beside if score.near <= along <= score.far else float("inf") for along, beside in pairs]
-    pairs = [(along + 1e4 * max(0.0, score.near - along), beside) for along, beside in pairs]
-    first = min(along + 1e4 * max(0.0, beside - score.width**2) for along, beside in pairs)
+    pairs = [(along, beside if along >= score.near else float("inf")) for along, beside in pairs]
+    first = min(along + 500 / score.width * max(0.0, beside - score.width**2) for along, beside in pairs)
     return [
         float("inf") if beside == float("inf") else beside + 0.04 * max(0.0, along - first - score.depth) ** 2
         for along, beside in pairs
@@ -46,7 +47,8 @@ def assert_best(found, positions, valid, origins, directions, score):
     """Compare with the loop: the scores of what was found must be the smallest there are; each is found once."""
     count = found.index.shape[-1]
     # The products of the brute force lose digits of squared distances of up to 16, in float32 about 1e-6 of each. The
-    # first surface moves by 1e4 times that where it is judged by the distance beside the ray, and a score by 0.2 of it.
+    # first surface moves by up to 1e4 times that where it is judged by the distance beside the ray, and a score by 0.2
+    # of it.
     tolerance = (1e-5 if positions.dtype == torch.float32 else 1e-13) * (
         200 if isinstance(score, BesideAndBehind) else 1
     )
@@ -129,15 +131,16 @@ def test_compiled_search_depends_neither_on_threads_nor_on_other_rays(score):
     assert torch.equal(alone.index[:, 90:99], some.index)
 
 
+@pytest.mark.parametrize("score", SCORES)
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_small_and_large_worlds(backend, scale):
+def test_small_and_large_worlds(backend, scale, score):
     positions, (origins, directions) = scale * points(), lines()
     valid = torch.ones(2, 300, dtype=torch.bool)
-    score = BesideRay(0.5 * scale, 6 * scale)
+    scaled = type(score)(*(scale * length for length in astuple(score)))
 
-    found = RaySearch(positions, valid, backend).closest(scale * origins, directions, 9, score)
-    same = RaySearch(positions / scale, valid, backend).closest(origins, directions, 9, SCORES[0])
+    found = RaySearch(positions, valid, backend).closest(scale * origins, directions, 9, scaled)
+    same = RaySearch(positions / scale, valid, backend).closest(origins, directions, 9, score)
 
     assert torch.equal(found.index.sort(dim=-1).values, same.index.sort(dim=-1).values)
 

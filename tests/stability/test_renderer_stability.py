@@ -220,11 +220,12 @@ def test_the_order_of_particles_does_not_matter(option: str, name: str, mode: Mo
     torch.testing.assert_close(there.rgbs, here.rgbs, rtol=0, atol=0.02 if mode.is_autocast else 1e-5)
 
 
+@pytest.mark.parametrize("option", ["surface", "splat"])
 @pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e3, 1e6])
-def test_a_scaled_world_with_scaled_settings_stops_the_same_light(factor: float, device: torch.device):
-    """The surface renderer measures density per footprint, so nothing in it knows how long a metre is."""
-    base = stage("renderer", "surface", FLOAT64, device).eval()
-    other = stage("renderer", "surface", FLOAT64, device, scale=factor).eval()
+def test_a_scaled_world_with_scaled_settings_stops_the_same_light(option: str, factor: float, device: torch.device):
+    """Surface measures density per footprint, splat all lengths per surface scale: neither knows what a metre is."""
+    base = stage("renderer", option, FLOAT64, device).eval()
+    other = stage("renderer", option, FLOAT64, device, scale=factor).eval()
     rays = rays_for(SCENES["ordinary"](), FLOAT64, device)
 
     here = base(particles_at(cloud(), FLOAT64, device), rays, None)

@@ -29,7 +29,8 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "feature_limit": 1e4,
     },
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},
-    f"{_RENDERER}splat.SplatRenderer": {"candidate_backend": "auto"},
+    # kernel_scales and layer_depth were in metres.
+    f"{_RENDERER}splat.SplatRenderer": {"candidate_backend": "auto", "surface_scale": 1.0},
 }
 """By class: arguments added since the first checkpoints, with values that leave those models as they were."""
 

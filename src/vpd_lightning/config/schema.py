@@ -23,6 +23,7 @@ class SceneConfig:
     r_a_s: float = MISSING
     kernel_radii: list[float] = MISSING
     kernel_bandwidths: list[float] = MISSING
+    surface_scale: float = MISSING
     location_scale: float = MISSING
     location_noise: float = MISSING
     near: float = MISSING
@@ -206,7 +207,7 @@ def check_scene(scene: dict[str, Any]) -> None:
         ConfigError: a value out of its range; the message says what was given and what is allowed.
     """
     _require_finite(scene)
-    for name in ("r_s", "r_a_s", "location_scale", "near"):
+    for name in ("r_s", "r_a_s", "surface_scale", "location_scale", "near"):
         _require(scene[name] > 0, f"scene.{name}", scene[name], "a number above 0")
     _require(scene["location_noise"] >= 0, "scene.location_noise", scene["location_noise"], "a number from 0 up")
     _require(scene["near"] < scene["far"], "scene.near", scene["near"], f"less than scene.far, which is {scene['far']}")

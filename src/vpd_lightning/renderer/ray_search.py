@@ -37,13 +37,18 @@ class BesideAndBehind:
     """Score by the squared distance beside the ray, and by how far behind the first surface.
 
     ``beside^2 + 0.04 max(0, along - first - depth)^2``, where ``first`` is the smallest ``along`` of all particles
-    within ``width`` of the ray (of those farther away, the distance beside counts ten thousandfold). What is closer
-    than ``near``, or behind the camera, counts as far along the ray.
+    within ``width`` of the ray (of those farther away, ``500 / width max(0, beside^2 - width^2)`` is added). What is
+    closer than ``near``, or behind the camera, is left out. Nothing in it knows how long a metre is.
     """
 
     near: float
     width: float
     depth: float
+
+    @property
+    def steepness(self) -> float:
+        """What a square metre beyond ``width`` counts, in metres."""
+        return 500 / self.width
 
 
 RayScore = BesideRay | BesideAndBehind
@@ -183,8 +188,8 @@ def _scores(along: Tensor, beside: Tensor, score: RayScore) -> Tensor:
     """Turn distances along and squared distances beside the rays into scores; both inputs are used up."""
     if isinstance(score, BesideRay):
         return beside.masked_fill_((along < score.near) | (along > score.far), torch.inf)
-    along.add_((score.near - along).clamp_(min=0), alpha=1e4)
-    first = (beside - score.width**2).clamp_(min=0).mul_(1e4).add_(along).amin(dim=-1, keepdim=True)
+    beside.masked_fill_(along < score.near, torch.inf)
+    first = (beside - score.width**2).clamp_(min=0).mul_(score.steepness).add_(along).amin(dim=-1, keepdim=True)
     behind = along.sub_(first + score.depth).clamp_(min=0)
     return beside.addcmul_(behind, behind, value=0.04)
 

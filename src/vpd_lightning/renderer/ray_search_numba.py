@@ -104,15 +104,15 @@ def _scored_search(given: tuple[np.ndarray, ...], score: RayScore, index: np.nda
     slack = dtype.type(100 * np.finfo(dtype).eps)
     first = np.zeros(num_rays, dtype)
     if isinstance(score, BesideRay):
-        _search(*given, _limits(dtype, score.near, score.far, 0.0), slack, _BESIDE, first, index, mask)
+        _search(*given, _limits(dtype, score.near, score.far, 0.0, 0.0), slack, _BESIDE, first, index, mask)
         return
-    limits = _limits(dtype, score.near, 0.0, score.width**2)
+    limits = _limits(dtype, score.near, 0.0, score.width**2, score.steepness)
     _search(*given, limits, slack, _FIRST, first, np.zeros((num_rays, 1), np.int64), np.zeros((num_rays, 1), np.bool_))
     _search(*given, limits, slack, _BEHIND, first + dtype.type(score.depth), index, mask)
 
 
-def _limits(dtype: np.dtype, near: float, far: float, width: float) -> tuple[np.floating, ...]:
-    return tuple(dtype.type(value) for value in (near, far, width, 1e4, 0.04, 0.0, np.nan, np.inf))
+def _limits(dtype: np.dtype, near: float, far: float, width: float, beside: float) -> tuple[np.floating, ...]:
+    return tuple(dtype.type(value) for value in (near, far, width, beside, 0.04, 0.0, np.nan, np.inf))
 
 
 # Products and sums are never contracted (no fastmath): a particle has the same score wherever it is computed.
@@ -126,8 +126,8 @@ def _score(kind, beside, along, limits, first):
     near, far, width, steep, weight, zero, nan, _ = limits
     if kind == _BESIDE:
         return beside if along >= near and along <= far else nan
-    early = near - along
-    along = along + steep * (early if early > zero else zero)
+    if not along >= near:
+        return nan
     if kind == _FIRST:
         wide = beside - width
         return along + steep * (wide if wide > zero else zero)
@@ -169,11 +169,10 @@ def _bound_all(kind, spheres, o, d, limits, first, slack, bounds):
             is_there = along + reach >= near and along - reach <= far
             bounds[slot] = beside * beside if is_there else nan
         else:
-            # Scores fall up to near and rise behind it: the least is at near, or at the end that is nearer to it.
+            # Scores rise with the distance along the ray: the least is where the sphere begins, or at near.
             nearest = along - reach if along - reach > near else near
-            nearest = along + reach if along + reach < nearest else nearest
             bound = _score(kind, beside * beside, nearest, limits, first)
-            bounds[slot] = bound if along == along else nan
+            bounds[slot] = bound if along + reach >= near else nan
 
 
 @numba.njit(nogil=True, cache=True)

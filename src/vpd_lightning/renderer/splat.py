@@ -19,7 +19,10 @@ class SplatRenderer(AbstractRenderer):
     front layer and a back layer by their distance along the ray. Each layer gives the network its mean features under
     Gaussian kernels of ``kernel_scales``, the mean offset from the ray (whether the ray passes beside a silhouette),
     and its density. The network returns two colours and two opacities; a background of the view direction closes the
-    ray.
+    ray. A ray with no particle in front of its camera shows the background alone.
+
+    ``surface_scale`` is in metres: about as far as a surface reaches beside and behind a particle on it.
+    ``kernel_scales`` (widths beside the ray) and ``layer_depth`` (along it) are multiples of it.
     """
 
     # Paper: renders by volume integration of a radiance field (renderer/point_nerf.py); this one is ours.
@@ -31,6 +34,7 @@ class SplatRenderer(AbstractRenderer):
         hidden_dim: int,
         num_layers: int,
         num_candidates: int,
+        surface_scale: float,
         kernel_scales: Sequence[float],
         layer_depth: float,
         near: float,
@@ -40,17 +44,22 @@ class SplatRenderer(AbstractRenderer):
     ):
         super().__init__()
         check_backend(candidate_backend)
-        if min(kernel_scales) <= 0 or layer_depth <= 0:
-            raise ValueError(f"kernel_scales {list(kernel_scales)} and layer_depth {layer_depth} must be positive")
+        if min(*kernel_scales, layer_depth, surface_scale) <= 0:
+            raise ValueError(
+                "kernel_scales, layer_depth and surface_scale must be positive, got "
+                f"{list(kernel_scales)}, {layer_depth} and {surface_scale}"
+            )
         if num_candidates < 1 or ray_chunk_size < 1:
             raise ValueError(
                 f"num_candidates and ray_chunk_size must be at least 1, got {num_candidates}, {ray_chunk_size}"
             )
         if not 0 <= near < far:
             raise ValueError(f"near must lie in [0, far), got near={near}, far={far}")
-        self.num_candidates, self.layer_depth, self.near, self.far = num_candidates, layer_depth, near, far
-        self.candidate_backend = candidate_backend
-        self.kernel_scales, self.ray_chunk_size = list(kernel_scales), ray_chunk_size
+        self.num_candidates, self.near, self.far = num_candidates, near, far
+        self.candidate_backend, self.ray_chunk_size = candidate_backend, ray_chunk_size
+        # In metres from here on.
+        self.kernel_scales = [surface_scale * scale for scale in kernel_scales]
+        self.layer_depth = surface_scale * layer_depth
         num_scales = len(self.kernel_scales)
         layer_dim = num_scales * (feature_dim + 4) + 1
         widths = [2 * layer_dim + 3, *[hidden_dim] * num_layers]
@@ -90,13 +99,12 @@ class SplatRenderer(AbstractRenderer):
     ) -> tuple[Tensor, Tensor, Tensor]:
         device_type = origins.device.type
         with torch.autocast(device_type, enabled=False):
-            inputs, depth = self._layers(particles, index, origins, directions)
+            inputs, depth, sees_any = self._layers(particles, index, origins, directions)
         outputs = self.network(torch.cat([inputs, directions], dim=-1)).to(origins.dtype)
         colors = torch.sigmoid(outputs[..., :6]).unflatten(-1, (2, 3))
         alphas = torch.sigmoid(outputs[..., 6:] + 1.0)
         background = torch.sigmoid(self.background(directions).to(origins.dtype))
-        any_particle = particles.mask.any(dim=1)[:, None, None]
-        alphas = alphas * any_particle
+        alphas = alphas * sees_any
         front, back = alphas[..., :1], (1 - alphas[..., :1]) * alphas[..., 1:]
         left = 1 - front - back
         rgbs = front * colors[..., 0, :] + back * colors[..., 1, :] + left * background
@@ -105,8 +113,8 @@ class SplatRenderer(AbstractRenderer):
 
     def _layers(
         self, particles: Particles, index: Tensor, origins: Tensor, directions: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the network's inputs (``batch ray input``) and the two layers' distances along the ray."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the network's inputs (``batch ray input``), the layers' distances, and whether there is a particle."""
         batch = torch.arange(len(index), device=index.device)[:, None, None]
         flat = (batch * particles.num_particles + index.clamp(min=0)).flatten()
 
@@ -118,25 +126,26 @@ class SplatRenderer(AbstractRenderer):
         beside = offsets - along[..., None] * directions[:, :, None]
         square = beside.square().sum(dim=-1)
         usable = gather(particles.mask[..., None]).squeeze(-1) & (along > self.near) & (index >= 0)
-        # What cannot be used counts for nearly nothing; a slot without a particle for nothing at all.
-        floor = torch.where(index >= 0, -30.0, -1e4).to(along.dtype)
-        features = gather(particles.features)
-
-        in_front = (self._front(along, square, usable) + self.layer_depth - along) / (0.3 * self.layer_depth)
-        inputs, depths = [], []
-        for membership in (nn.functional.logsigmoid(in_front), nn.functional.logsigmoid(-in_front)):
-            membership = torch.where(usable, membership.clamp(min=-30.0), floor)
-            for number, scale in enumerate(self.kernel_scales):
-                logits = membership - square / (2 * scale**2)
-                weights = torch.softmax(logits, dim=-1)
-                # (batch ray 1 candidate) @ (batch ray candidate channel): never a weighted copy of the features
-                inputs.append((weights[:, :, None] @ features).squeeze(2))
-                inputs.append((weights[:, :, None] @ beside).squeeze(2) / scale)
-                inputs.append(torch.logsumexp(logits, dim=-1, keepdim=True).clamp(min=-10.0) / 5)
-                if number == 0:
-                    depths.append((weights * along).sum(dim=-1, keepdim=True))
-            inputs.append(torch.log1p(membership.exp().sum(dim=-1, keepdim=True)))
-        return torch.cat(inputs, dim=-1), torch.cat(depths, dim=-1)
+        front = self._front(along, square, usable)
+        in_front = (front + self.layer_depth - along) / (0.3 * self.layer_depth)
+        memberships = nn.functional.logsigmoid(torch.stack([in_front, -in_front], dim=2)).clamp(min=-30.0)
+        # What cannot be used, in particular what is behind the camera, counts for nothing at all.
+        memberships = memberships.masked_fill(~usable[:, :, None], -1e30)
+        scales = torch.tensor(self.kernel_scales, dtype=along.dtype, device=along.device)[:, None]
+        logits = memberships[:, :, :, None] - (square[:, :, None] / (2 * scales.square()))[:, :, None]
+        weights = torch.softmax(logits, dim=-1)
+        # One product for all layers and scales: (layer * scale, candidate) @ (candidate, channel) of each ray.
+        values = torch.cat([gather(particles.features), beside, along[..., None]], dim=-1)
+        features, offsets, distances = (
+            (weights.flatten(2, 3) @ values)
+            .unflatten(2, logits.shape[2:4])
+            .split([particles.features.shape[-1], 3, 1], dim=-1)
+        )
+        visible = torch.logsumexp(logits, dim=-1, keepdim=True).clamp(min=-10.0) / 5
+        density = torch.log1p(memberships.exp().sum(dim=-1, keepdim=True))
+        inputs = torch.cat([features, offsets / scales, visible], dim=-1).flatten(3)
+        inputs = torch.cat([inputs, density], dim=-1).flatten(2)
+        return inputs, distances[:, :, :, 0, 0], usable.any(dim=-1, keepdim=True)
 
     @torch.no_grad()
     def _front(self, along: Tensor, square: Tensor, usable: Tensor) -> Float[Tensor, "batch ray 1"]:
@@ -151,7 +160,7 @@ class SplatRenderer(AbstractRenderer):
     def _candidates(
         self, particles: Particles, origins: Tensor, directions: Tensor
     ) -> Int[Tensor, "batch ray candidate"]:
-        """Choose the particles closest to each ray, hidden ones and those behind the camera last; -1 for none."""
+        """Choose the particles closest to each ray, hidden ones last, none behind the camera; -1 for none."""
         score = BesideAndBehind(self.near, 0.5 * self.kernel_scales[-1], 3 * self.layer_depth)
         count = min(self.num_candidates, particles.num_particles)
         search = RaySearch(particles.positions, particles.mask, self.candidate_backend)
