@@ -52,7 +52,8 @@ class Simulator(AbstractSystem):
     def forward(self, batch: VideoBatch) -> SimulatorOutput:
         """Predict the rays of every step of the batch; all steps are rendered in one call.
 
-        ``auxiliary`` is what the encoder offers of the current frame, and of the one before as ``previous_NAME``.
+        ``auxiliary`` is what the encoder offers of the current frame, and of the one before as ``previous_NAME``; where
+        the batch holds future frames, what it observes of them, too, as ``future_NAME``.
         """
         previous = self.encoder(batch.context[:, 0], batch.keys, "previous")
         current = self.encoder(batch.context[:, 1], batch.keys, "current")
@@ -60,7 +61,15 @@ class Simulator(AbstractSystem):
         states = self.unroll(previous.particles, current.particles, num_steps, batch.keys)
         rendered = self._render_steps(states, batch.rays, batch.keys if self.training else None)
         before = {f"previous_{name}": value for name, value in previous.auxiliary.items()}
-        return SimulatorOutput(rendered, states, current.auxiliary | before)
+        return SimulatorOutput(rendered, states, current.auxiliary | before | self._observed(batch))
+
+    def _observed(self, batch: VideoBatch) -> dict[str, Tensor]:
+        """Return what the encoder observes of the future frames as ``future_NAME`` (axes ``batch time ...``)."""
+        if batch.future is None:
+            return {}
+        steps = range(batch.future.depth.shape[1])
+        seen = [self.encoder.observe(batch.future[:, step], batch.keys, str(step)) for step in steps]
+        return {f"future_{name}": torch.stack([step[name] for step in seen], dim=1) for name in seen[0]}
 
     def unroll(self, previous: Particles, current: Particles, num_steps: int, keys: RandomKeys) -> list[Particles]:
         """Apply the dynamics ``num_steps`` times; returns the predicted states, the first one a step after current."""

@@ -19,6 +19,10 @@ class Contacts:
     normals: Float[Tensor, "batch probe 3"]
     lateral: Float[Tensor, "batch probe"]
 
+    def first(self, count: int) -> "Contacts":
+        """Return those of the first probes."""
+        return Contacts(self.distances[:, :count], self.normals[:, :count], self.lateral[:, :count])
+
 
 @dataclass(frozen=True)
 class Resolved:
@@ -73,16 +77,12 @@ def nearest_static_contacts(
     The point-to-plane distance is exact on flat surfaces however sparse the particles are. Without any static
     particle, or beyond ``far`` metres, the distance is ``far`` and the normal zero: no contact.
     """
-    with torch.no_grad():
-        oriented = static_mask & (static_normals.square().sum(dim=-1) > 0.5)
-        square = (probes[:, :, None] - static_positions[:, None]).square().sum(dim=-1)
-        nearest_square, index = square.masked_fill(~oriented[:, None], float("inf")).min(dim=-1)
-    batch = torch.arange(len(probes), device=probes.device)[:, None]
-    normals = static_normals[batch, index]
-    offsets = probes - static_positions[batch, index]
+    oriented = static_mask & (static_normals.square().sum(dim=-1) > 0.5)
+    index, exists = _nearest(probes, static_positions, oriented[:, None])
+    normals, offsets = _points(static_normals, index), probes - _points(static_positions, index)
     distances = (offsets * normals).sum(dim=-1)
     lateral = (offsets - distances[..., None] * normals).square().sum(dim=-1).clamp(min=1e-12).sqrt()
-    known = torch.isfinite(nearest_square) & (nearest_square < far**2)
+    known = exists & (offsets.square().sum(dim=-1) < far**2)
     return Contacts(
         distances=torch.where(known, distances, torch.full_like(distances, far)),
         normals=normals * known[..., None],
@@ -105,12 +105,11 @@ def nearest_body_contacts(
     bodies = torch.where(is_owned, points.bodies, -1)
     oriented = is_owned & (normals.square().sum(dim=-1) > 0.5)
     different = (bodies[:, :, None] != bodies[:, None]) & oriented[:, None] & is_owned[:, :, None]
-    square = (positions[:, :, None] - positions[:, None]).square().sum(dim=-1).masked_fill(~different, torch.inf)
-    nearest_square, other = square.min(dim=-1)
+    other, exists = _nearest(positions, positions, different)
     offset = positions - _points(positions, other)
     height = (offset * _points(normals, other)).sum(dim=-1)
-    beside = nearest_square - height.square()
-    known = torch.isfinite(nearest_square) & (beside < reach[:, None].square()) & (height > -max_depth)
+    beside = offset.square().sum(dim=-1) - height.square()
+    known = exists & (beside < reach[:, None].square()) & (height > -max_depth)
     return BodyContacts(other, known)
 
 
@@ -287,6 +286,24 @@ class ContactSolver:
             push = self.inertia.gathered(index).push(arm, sign * impulses / _points(self.masses, index))
             motion = motion.pushed(_summed(push, index, self.points.members.shape[1]))
         return motion
+
+
+@torch.no_grad()
+def _nearest(
+    queries: Float[Tensor, "batch query 3"],
+    points: Float[Tensor, "batch point 3"],
+    usable: Bool[Tensor, "batch any point"],
+) -> tuple[Int[Tensor, "batch query"], Bool[Tensor, "batch query"]]:
+    """Return the nearest usable point of each query and whether there is one.
+
+    Only the order matters here, so the product form of the squared distance will do, in half the time: it may take one
+    of two points for the nearer that are equally far within a few millimetres in a world of ten metres.
+    """
+    origin = queries.mean(dim=1, keepdim=True)
+    local, others = queries - origin, points - origin
+    order = torch.baddbmm(others.square().sum(dim=-1)[:, None], local, others.mT, alpha=-2)
+    lowest, index = order.masked_fill(~usable, torch.inf).min(dim=-1)
+    return index, torch.isfinite(lowest)
 
 
 def _as_push(motion: BodyMotion) -> Push:

@@ -249,20 +249,18 @@ class InertialDynamics(AbstractDynamics):
         offsets = probe_positions[:, None] - memory.motion.centers[:, :, None]
         moved = memory.motion.displacements[:, :, None] + memory.motion.turned(offsets) - offsets
         statics = (static_positions, _take(normals, memory.static_index), memory.static_mask, self.contact_reach)
-        contacts = nearest_static_contacts(probe_positions, *statics)
+        points = self._contact_points(probe_positions, memory, members)
+        contacts = nearest_static_contacts(points.positions, *statics)
         motion = self.forces(
             probe_positions,
             (members[..., None] * moved).sum(dim=1),
-            contacts,
+            contacts.first(probe_positions.shape[1]),
             memory.mask[:, probes],
             members,
             memory.motion,
             inertia,
         )
         motion = replace(motion, strains=_elastic(motion, materials))
-        points = self._contact_points(probe_positions, memory, members)
-        if self.mirror_hidden:
-            contacts = nearest_static_contacts(points.positions, *statics)
         solver = ContactSolver(
             points=points,
             inertia=inertia,

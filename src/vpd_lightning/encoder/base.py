@@ -40,3 +40,11 @@ class AbstractEncoder(nn.Module, ABC):
     @abstractmethod
     def forward(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> EncoderOutput:
         """Encode; ``purpose`` separates the draws of the two context frames."""
+
+    def observe(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> dict[str, Tensor]:
+        """Return what a loss on motion may compare with, by name, for frames of one time step; nothing by default.
+
+        ``positions`` (``batch point 3``, metres), ``colors`` (in [0, 1]) and ``mask`` of points that may move, with
+        the same number of points for every frame.
+        """
+        return {}

@@ -111,6 +111,26 @@ class UnprojectingEncoder(AbstractEncoder):
             normals=take(depth_normals(frames.depth, frames.cameras).flatten(1, 3)) if self.use_normals else None,
         )
 
+    @torch.no_grad()
+    def observe(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> dict[str, Tensor]:
+        """Return a quarter as many points that may move as there are particles; nothing without a background."""
+        if self.background is None:
+            return {}
+        points = unproject(frames.depth, frames.cameras).flatten(1, 3)
+        measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
+        candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
+        loose = candidates & self.background(_cropped(frames, candidates)).flatten(1)
+        count = max(1, self.num_particles // 4)
+        drawn = [
+            choose(allowed, count, generator)
+            for allowed, generator in zip(loose, keys.generators(f"observed/{purpose}"), strict=True)
+        ]
+        index, mask = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+        rgb = self._colors(frames).flatten(1, 3)
+        taken = [torch.gather(values, 1, index[..., None].expand(-1, -1, 3)) for values in (points, rgb)]
+        positions, colors = (torch.where(mask[..., None], values, 0.0) for values in taken)
+        return {"positions": positions, "colors": colors, "mask": mask}
+
     def _choose(
         self, candidates: Bool[Tensor, "batch point"], moving: Tensor | None, keys: RandomKeys, purpose: str
     ) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,83 @@
+"""Predicted particles held against where things are seen later: self-supervision of motion by RGB-D alone."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vpd_lightning.errors import ConfigError
+from vpd_lightning.losses.base import AbstractLoss
+from vpd_lightning.types import SimulatorOutput, VideoBatch
+
+_OUTLIER = 0.05
+"""Evidence that every particle has from nowhere: what is hidden in the later frame costs a bounded amount."""
+
+
+class MotionLoss(AbstractLoss):
+    """Negative log-evidence of predicted particles among the points seen at that step, and of these among those.
+
+    The evidence of a particle is the sum of Gaussian kernels in space (``scales``, metres) and colour
+    (``color_scale``) at the points that may move in the later frame, as in coherent point drift (Myronenko and Song
+    2010); points are held against particles in the same way, so that none of them is left over. Averaged over scales:
+    the widest gives a direction from afar, the narrowest a place. Neither masks nor tracks are used, only depth and
+    colour of the frames that a video has anyway.
+    """
+
+    # Paper: trains on colours of rendered rays alone. There, motion reaches the dynamics only through the renderer.
+
+    name = "motion"
+
+    def __init__(self, *, weight: float, scales: Sequence[float], color_scale: float, num_particles: int):
+        super().__init__()
+        if weight < 0 or color_scale <= 0 or not scales or min(scales) <= 0 or num_particles < 1:
+            raise ValueError(
+                "weight must not be negative, scales and color_scale must be positive, num_particles at least 1; got "
+                f"{weight}, {list(scales)}, {color_scale}, {num_particles}"
+            )
+        self.weight, self.scales, self.color_scale = weight, list(scales), color_scale
+        self.num_particles = num_particles
+
+    def forward(self, output: SimulatorOutput, batch: VideoBatch) -> Float[Tensor, ""]:
+        """Return the mean over steps and scales.
+
+        Raises:
+            ConfigError: the batch holds no future frames, or the encoder does not tell what may move.
+        """
+        first = output.states[0]
+        if "future_positions" not in output.auxiliary or first.moving is None or first.colors is None:
+            raise ConfigError(
+                "the loss motion needs future frames and an encoder that tells what may move.\n"
+                "Set data.load_future=true, and encoder=unet_objects."
+            )
+        index, valid = _first_of(first.mask & first.moving, self.num_particles)
+        positions = torch.stack([_take(state.positions, index) for state in output.states], dim=1)
+        colors = _take(first.colors, index)[:, None].expand_as(positions)
+        seen, seen_colors = output.auxiliary["future_positions"], output.auxiliary["future_colors"]
+        seen_mask = output.auxiliary["future_mask"]
+        square = (positions[..., :, None, :] - seen[..., None, :, :]).square().sum(dim=-1)
+        tone = (colors[..., :, None, :] - seen_colors[..., None, :, :]).square().sum(dim=-1) / (2 * self.color_scale**2)
+        valid = valid[:, None].expand(positions.shape[:-1])
+        total = []
+        for scale in self.scales:
+            evidence = torch.exp(-square / (2 * scale**2) - tone)
+            total.append(_cost(evidence, valid, seen_mask) + _cost(evidence.mT, seen_mask, valid))
+        return torch.stack(total).mean()
+
+
+def _cost(evidence: Tensor, valid: Tensor, others: Tensor) -> Tensor:
+    """Return the mean negative log-evidence of the valid rows among the valid columns."""
+    there = others.to(evidence.dtype)
+    cost = -torch.log((evidence * there[..., None, :]).sum(dim=-1) + _OUTLIER)
+    share = valid.to(evidence.dtype)
+    return (cost * share).sum() / share.sum().clamp(min=1)
+
+
+def _first_of(chosen: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return slots of the first chosen particles (slots are in random order), and which of them are valid."""
+    index = torch.sort((~chosen).to(torch.uint8), dim=1, stable=True).indices[:, :count]
+    return index, torch.gather(chosen, 1, index)
+
+
+def _take(values: Tensor, index: Tensor) -> Tensor:
+    return torch.gather(values, 1, index[..., None].expand(-1, -1, values.shape[-1]))
