@@ -110,6 +110,7 @@ def build_simulator(variant: str, scale: Scale, is_gpu: bool) -> Simulator:
         ("hierarchical_gnn", dynamics),
         (option, renderer),
         checkpoint_dynamics=saves,
+        pixel_gradient_to_motion=1.0,
     )
 
 

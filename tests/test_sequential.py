@@ -298,7 +298,7 @@ def test_dynamics_that_changes_nothing_is_the_static_scene():
     scene = model.encode(frames.rgb, frames.depth, frames.cameras)
     assert predicted.shape == (3, 2, 8, 8, 3)
     assert all(torch.equal(step, model.render([scene.current], cameras[0])[0]) for step in predicted)
-    plain = Simulator(**stages())
+    plain = Simulator(**stages(), pixel_gradient_to_motion=1.0)
     plain.load_state_dict(model.state_dict())
     assert torch.equal(plain.predict_frames(frames, three), predicted)  # it is used as the end-to-end model is
 

@@ -38,7 +38,7 @@ def renderer():
 
 
 def simulator(dynamics=None, **changes):
-    settings = {"location_noise": 0.0, "checkpoint_dynamics": False, **changes}
+    settings = {"location_noise": 0.0, "checkpoint_dynamics": False, "pixel_gradient_to_motion": 1.0, **changes}
     return Simulator(encoder=encoder(), dynamics=dynamics or PersistenceDynamics(), renderer=renderer(), **settings)
 
 

@@ -60,6 +60,7 @@ class AutoEncoder(Simulator):
             renderer=renderer,
             location_noise=location_noise,
             checkpoint_dynamics=checkpoint_dynamics,
+            pixel_gradient_to_motion=1.0,
         )
         if any(True for _ in dynamics.parameters()):
             raise ValueError(
@@ -111,6 +112,7 @@ class SequentialSimulator(Simulator):
             renderer=renderer,
             location_noise=location_noise,
             checkpoint_dynamics=checkpoint_dynamics,
+            pixel_gradient_to_motion=1.0,
         )
         if num_points < 1:
             raise ValueError(f"num_points must be at least 1, got {num_points}")

@@ -30,6 +30,9 @@ class Simulator(AbstractSystem):
 
     ``location_noise`` is the standard deviation (metres) of the noise on particle positions during training rollouts.
     ``checkpoint_dynamics`` recomputes each dynamics step in the backward pass: exact gradients, less memory.
+    ``pixel_gradient_to_motion`` is the share of the gradient of rendered rays that reaches predicted positions
+    (features get all of it): 1 is the paper; with a loss on motion itself, 0 keeps an unfinished renderer from steering
+    bodies.
     """
 
     num_context_frames = 2
@@ -42,12 +45,16 @@ class Simulator(AbstractSystem):
         renderer: AbstractRenderer,
         location_noise: float,
         checkpoint_dynamics: bool,
+        pixel_gradient_to_motion: float,
     ):
         super().__init__()
         if location_noise < 0:
             raise ValueError(f"location_noise must not be negative, got {location_noise}")
         self.encoder, self.dynamics, self.renderer = encoder, dynamics, renderer
+        if not 0 <= pixel_gradient_to_motion <= 1:
+            raise ValueError(f"pixel_gradient_to_motion must lie between 0 and 1, got {pixel_gradient_to_motion}")
         self.location_noise, self.checkpoint_dynamics = location_noise, checkpoint_dynamics
+        self.pixel_gradient_to_motion = pixel_gradient_to_motion
 
     def forward(self, batch: VideoBatch) -> SimulatorOutput:
         """Predict the rays of every step of the batch; all steps are rendered in one call.
@@ -59,9 +66,18 @@ class Simulator(AbstractSystem):
         current = self.encoder(batch.context[:, 1], batch.keys, "current")
         num_steps = batch.rays.origins.shape[1]
         states = self.unroll(previous.particles, current.particles, num_steps, batch.keys)
-        rendered = self._render_steps(states, batch.rays, batch.keys if self.training else None)
+        shown = [self._shown(state) for state in states]
+        rendered = self._render_steps(shown, batch.rays, batch.keys if self.training else None)
         before = {f"previous_{name}": value for name, value in previous.auxiliary.items()}
         return SimulatorOutput(rendered, states, current.auxiliary | before | self._observed(batch))
+
+    def _shown(self, state: Particles) -> Particles:
+        """Return a state whose positions get their share of the gradient of what is rendered."""
+        share = self.pixel_gradient_to_motion
+        if share == 1:
+            return state
+        still = state.positions.detach()
+        return replace(state, positions=still + share * (state.positions - still) if share else still)
 
     def _observed(self, batch: VideoBatch) -> dict[str, Tensor]:
         """Return what the encoder observes of the future frames as ``future_NAME`` (axes ``batch time ...``)."""

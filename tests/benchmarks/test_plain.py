@@ -27,6 +27,7 @@ def small_simulator(saves_memory: bool = False) -> Simulator:
         ("hierarchical_gnn_small", {"num_abstract_nodes": 32, "r_s": 0.5, "r_a_s": 0.6}),
         ("point_nerf_small", {"checkpoint_chunks": saves_memory, "ray_chunk_size": 8 if saves_memory else 1024}),
         checkpoint_dynamics=saves_memory,
+        pixel_gradient_to_motion=1.0,
     )
     torch.manual_seed(1)
     for field in (simulator.renderer.coarse, simulator.renderer.fine):

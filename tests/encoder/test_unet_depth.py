@@ -41,7 +41,7 @@ def simulator(**changes):
     )  # fmt: skip
     return Simulator(
         encoder=encoder(**changes), dynamics=PersistenceDynamics(), renderer=renderer,
-        location_noise=0.0, checkpoint_dynamics=False,
+        location_noise=0.0, checkpoint_dynamics=False, pixel_gradient_to_motion=1.0,
     )  # fmt: skip
 
 

@@ -34,6 +34,7 @@ def simulator(
         renderer=stage("renderer", pair[1], mode, device, scale),
         location_noise=0.0,
         checkpoint_dynamics=False,
+        pixel_gradient_to_motion=1.0,
     ).train()
 
 

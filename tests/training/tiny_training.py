@@ -106,6 +106,7 @@ def tiny_simulator(dtype: torch.dtype = torch.float32) -> Simulator:
             renderer=TinyRenderer(),
             location_noise=1e-3,
             checkpoint_dynamics=False,
+            pixel_gradient_to_motion=1.0,
         )
     return simulator.to(dtype)
 

@@ -29,6 +29,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "feature_limit": 1e4,
     },
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},
+    "vpd_lightning.simulator.Simulator": {"pixel_gradient_to_motion": 1.0},
     # kernel_scales and layer_depth were in metres.
     f"{_RENDERER}splat.SplatRenderer": {"candidate_backend": "auto", "surface_scale": 1.0},
 }

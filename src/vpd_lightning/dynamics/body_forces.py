@@ -17,7 +17,10 @@ class BodyForces(nn.Module):
     Probes send their state and contact to the bodies; bodies exchange messages; each body then places
     ``num_forces`` forces by attention over its probes. A force changes the body's displacement by itself, and its
     spin by the torque about the body's centre through the inverse inertia, so that a contact at a few particles
-    moves and turns the whole body (Newton-Euler). One more force acts at the centre, without torque, as weight does.
+    moves and turns the whole body (Newton-Euler). One more force acts at the centre, without torque, as weight does,
+    and one acceleration is the same for all bodies, always: what it is, and where it points, is learned. Forces are at
+    most ``residual_share`` of ``force_scale`` (metres per step squared), which bounds the acceleration: while it is not
+    known, they must not try to stand in for it.
     Damping scales what was carried: impacts and friction remove motion
     in proportion to it. Zero-initialised: no force, hardly any damping (0.7 % a step).
     """
@@ -30,11 +33,14 @@ class BodyForces(nn.Module):
         num_forces: int,
         location_scale: float,
         force_scale: float,
+        residual_share: float,
         contact_range: float,
     ):
         super().__init__()
         self.num_forces, self.contact_range = num_forces, contact_range
         self.location_scale, self.force_scale = location_scale, force_scale
+        self.residual_scale = residual_share * force_scale
+        self.acceleration = nn.Parameter(torch.zeros(3))
         self.encode_probe = _mlp(19, hidden_dim, hidden_dim)
         self.encode_body = _mlp(2 * hidden_dim + 7, hidden_dim, hidden_dim)
         self.messages = nn.ModuleList(
@@ -130,11 +136,11 @@ class BodyForces(nn.Module):
         pair = torch.relu(pair + self.offset_query(offsets / self.contact_range))
         logits = self.attention(pair) + torch.log(share.clamp(min=1e-12))[..., None]
         attention = torch.softmax(logits, dim=2)  # batch body probe force
-        forces = self.force_scale * torch.tanh(self.force(pair)).unflatten(-1, (self.num_forces, 3))
+        forces = self.residual_scale * torch.tanh(self.force(pair)).unflatten(-1, (self.num_forces, 3))
         forces = attention[..., None] * forces
         push = forces.sum(dim=(2, 3))
         torque = cross(offsets, forces.sum(dim=3)).sum(dim=2)
-        weight = self.force_scale * torch.tanh(self.weight(body))
+        weight = self.residual_scale * torch.tanh(self.weight(body)) + self.force_scale * torch.tanh(self.acceleration)
         # Nearly one at initialisation; it may remove motion, never add any: a long rollout cannot feed on itself.
         keep = torch.sigmoid(self.damping(body) + 5.0)
         weight, torque = weight * there[..., None], torque * there[..., None]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from vpd_lightning.dynamics.rigid_motion import cross, rotate, rotation_from_spin
@@ -52,10 +52,11 @@ class BodyMotion:
         share = torch.where(excess > 0, length / norm.clamp(min=1e-18).sqrt(), 1.0)
         return eye + share * off - self.stretches
 
-    def turned(self, offsets: Float[Tensor, "batch body point 3"]) -> Float[Tensor, "batch body point 3"]:
-        """Return where offsets from the centre point after the step."""
-        matrices = rotation_from_spin(self.spins) @ self.deformation()
-        return rotate(matrices[:, :, None], offsets)
+    def turned(
+        self, offsets: Float[Tensor, "batch point 3"], bodies: Int[Tensor, "batch point"]
+    ) -> Float[Tensor, "batch point 3"]:
+        """Return where offsets of points from the centres of their bodies point after the step."""
+        return rotate(matrices_of(rotation_from_spin(self.spins) @ self.deformation(), bodies), offsets)
 
     def following_stretches(self) -> tuple[Tensor, Tensor]:
         """Return stretch and strain after the step, turned with the body."""
@@ -110,6 +111,20 @@ class Inertia:
             return torch.gather(values, 1, flat)
 
         return Inertia(take(self.inverse_turning), take(self.inverse_moments), take(self.softness))
+
+
+def vectors_of(
+    values: Float[Tensor, "batch body channel"], bodies: Int[Tensor, "batch point"]
+) -> Float[Tensor, "batch point channel"]:
+    """Return for each point the value of its body."""
+    return torch.gather(values, 1, bodies[..., None].expand(-1, -1, values.shape[-1]))
+
+
+def matrices_of(
+    values: Float[Tensor, "batch body 3 3"], bodies: Int[Tensor, "batch point"]
+) -> Float[Tensor, "batch point 3 3"]:
+    """Return for each point the matrix of its body."""
+    return torch.gather(values, 1, bodies[..., None, None].expand(-1, -1, 3, 3))
 
 
 def body_inertia(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from vpd_lightning.dynamics.body_motion import BodyMotion, Inertia, Push
+from vpd_lightning.dynamics.body_motion import BodyMotion, Inertia, Push, matrices_of, vectors_of
 from vpd_lightning.dynamics.materials import Materials
 from vpd_lightning.dynamics.rigid_motion import cross, rotate, rotation_from_spin
 
@@ -79,7 +79,7 @@ def nearest_static_contacts(
     """
     oriented = static_mask & (static_normals.square().sum(dim=-1) > 0.5)
     index, exists = _nearest(probes, static_positions, oriented[:, None])
-    normals, offsets = _points(static_normals, index), probes - _points(static_positions, index)
+    normals, offsets = vectors_of(static_normals, index), probes - vectors_of(static_positions, index)
     distances = (offsets * normals).sum(dim=-1)
     lateral = (offsets - distances[..., None] * normals).square().sum(dim=-1).clamp(min=1e-12).sqrt()
     known = exists & (offsets.square().sum(dim=-1) < far**2)
@@ -106,8 +106,8 @@ def nearest_body_contacts(
     oriented = is_owned & (normals.square().sum(dim=-1) > 0.5)
     different = (bodies[:, :, None] != bodies[:, None]) & oriented[:, None] & is_owned[:, :, None]
     other, exists = _nearest(positions, positions, different)
-    offset = positions - _points(positions, other)
-    height = (offset * _points(normals, other)).sum(dim=-1)
+    offset = positions - vectors_of(positions, other)
+    height = (offset * vectors_of(normals, other)).sum(dim=-1)
     beside = offset.square().sum(dim=-1) - height.square()
     known = exists & (beside < reach[:, None].square()) & (height > -max_depth)
     return BodyContacts(other, known)
@@ -156,12 +156,14 @@ class ContactSolver:
         self,
         *,
         points: ContactPoints,
+        centers: Float[Tensor, "batch body 3"],
         inertia: Inertia,
         materials: Materials,
         masses: Float[Tensor, "batch body 1"],
-        rest_speed: Tensor,
+        rest_speed: float,
     ):
-        self.points = points
+        self.points, self.own = points, points.bodies
+        self.offsets = points.positions - vectors_of(centers, self.own)
         self.inertia, self.materials, self.masses, self.rest_speed = inertia, materials, masses, rest_speed
 
     def resolve(
@@ -198,13 +200,12 @@ class ContactSolver:
         self, motion: BodyMotion, free: BodyMotion, contacts: Contacts, touchable: Tensor
     ) -> tuple[BodyMotion, _Touch]:
         """Lift the deepest point of each body out of what stands still, and slow its sliding."""
-        offsets = self.points.positions[:, None] - motion.centers[:, :, None]
-        normals = contacts.normals[:, None].expand_as(offsets)
-        turned = motion.turned(offsets)
-        moves = motion.displacements[:, :, None] + turned - offsets
-        ahead = contacts.distances[:, None] + (moves * normals).sum(dim=-1)
-        deepest, probe = ahead.masked_fill(~touchable, torch.inf).min(dim=-1, keepdim=True)
-        normal, arm, move = (_at(values, probe) for values in (normals, turned, moves))
+        turned = motion.turned(self.offsets, self.own)
+        moves = vectors_of(motion.displacements, self.own) + turned - self.offsets
+        ahead = contacts.distances + (moves * contacts.normals).sum(dim=-1)
+        deepest, probe = ahead[:, None].masked_fill(~touchable, torch.inf).min(dim=-1)
+        deepest = deepest[..., None]
+        normal, arm, move = (vectors_of(values, probe) for values in (contacts.normals, turned, moves))
         lift = torch.relu(-deepest) / self.inertia.response(arm, normal)
         push = self.inertia.push(arm, lift * normal)
         motion = motion.pushed(push)
@@ -228,13 +229,11 @@ class ContactSolver:
 
     def _part(self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts) -> tuple[BodyMotion, "_Pairs"]:
         """Push apart each pair of bodies at its deepest contact, half as far as needed from either side."""
-        offsets = self.points.positions[:, None] - motion.centers[:, :, None]
-        turned = (self.points.members[..., None] * motion.turned(offsets)).sum(dim=1)
-        own = self.points.bodies
-        there = _points(motion.centers + motion.displacements, own) + turned
-        facing = rotate(_matrices(rotation_from_spin(motion.spins), own), self.points.normals)
-        facing = _points(facing, contacts.other)
-        gaps = ((there - _points(there, contacts.other)) * facing).sum(dim=-1)
+        own, turned = self.own, motion.turned(self.offsets, self.own)
+        there = vectors_of(motion.centers + motion.displacements, own) + turned
+        facing = rotate(matrices_of(rotation_from_spin(motion.spins), own), self.points.normals)
+        facing = vectors_of(facing, contacts.other)
+        gaps = ((there - vectors_of(there, contacts.other)) * facing).sum(dim=-1)
         count = self.points.members.shape[1]
         bodies = torch.arange(count, device=own.device)
         from_first = own[:, None, None] == bodies[:, None, None]
@@ -245,9 +244,9 @@ class ContactSolver:
         pairs = _Pairs(
             first=bodies.repeat_interleave(count).expand(len(own), -1),
             second=bodies.repeat(count).expand(len(own), -1),
-            first_arms=_points(turned, probe),
-            second_arms=_points(turned, torch.gather(contacts.other, 1, probe)),
-            normals=_points(facing, probe),
+            first_arms=vectors_of(turned, probe),
+            second_arms=vectors_of(turned, torch.gather(contacts.other, 1, probe)),
+            normals=vectors_of(facing, probe),
             approach=torch.zeros_like(depth),
             is_active=depth > 0,
         )
@@ -271,19 +270,19 @@ class ContactSolver:
     @staticmethod
     def _pair_mean(values: Tensor, pairs: "_Pairs") -> Tensor:
         """Return the geometric mean of what two bodies are made of."""
-        return (_points(values, pairs.first) * _points(values, pairs.second)).clamp(min=1e-12).sqrt()
+        return (vectors_of(values, pairs.first) * vectors_of(values, pairs.second)).clamp(min=1e-12).sqrt()
 
     def _pair_response(self, pairs: "_Pairs", directions: Tensor) -> Tensor:
         """Return how far two bodies part, each at its contact, for a unit impulse."""
         each = [
-            self.inertia.gathered(index).response(arm, directions) / _points(self.masses, index)
+            self.inertia.gathered(index).response(arm, directions) / vectors_of(self.masses, index)
             for index, arm in pairs.sides()
         ]
         return each[0] + each[1]
 
     def _pair_pushed(self, motion: BodyMotion, pairs: "_Pairs", impulses: Tensor) -> BodyMotion:
         for sign, (index, arm) in zip((1, -1), pairs.sides(), strict=True):
-            push = self.inertia.gathered(index).push(arm, sign * impulses / _points(self.masses, index))
+            push = self.inertia.gathered(index).push(arm, sign * impulses / vectors_of(self.masses, index))
             motion = motion.pushed(_summed(push, index, self.points.members.shape[1]))
         return motion
 
@@ -316,7 +315,7 @@ def _velocity(push: Push, arms: Tensor) -> Tensor:
 
 
 def _gathered(push: Push, index: Tensor) -> Push:
-    return Push(_points(push.displacements, index), _points(push.spins, index), _matrices(push.strains, index))
+    return Push(vectors_of(push.displacements, index), vectors_of(push.spins, index), matrices_of(push.strains, index))
 
 
 def _summed(push: Push, index: Tensor, count: int) -> Push:
@@ -327,15 +326,3 @@ def _summed(push: Push, index: Tensor, count: int) -> Push:
         return values.new_zeros(len(values), count, *values.shape[2:]).scatter_add(1, flat, values)
 
     return Push(add(push.displacements), add(push.spins), add(push.strains))
-
-
-def _points(values: Float[Tensor, "batch any c"], index: Int[Tensor, "batch point"]) -> Tensor:
-    return torch.gather(values, 1, index[..., None].expand(-1, -1, values.shape[-1]))
-
-
-def _matrices(values: Float[Tensor, "batch any 3 3"], index: Int[Tensor, "batch point"]) -> Tensor:
-    return torch.gather(values, 1, index[..., None, None].expand(-1, -1, 3, 3))
-
-
-def _at(values: Float[Tensor, "batch body probe 3"], probe: Int[Tensor, "batch body 1"]) -> Tensor:
-    return torch.gather(values, 2, probe[..., None].expand(-1, -1, -1, 3)).squeeze(2)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from vpd_lightning.dynamics.rigid_motion import cross, rigid_fit, rotate, rotation_from_spin, weighted_sum
 
 _EVIDENCE = 0.3  # a match this strong (a perfect one counts 1) is believed by half
+_NUM_SPACED = 128  # points of which the spacing is measured
 _NO_MATCH = 0.1  # a body whose matches are believed by less than this was not seen before: no velocity
 
 
@@ -112,9 +113,9 @@ class FirstVelocity(nn.Module):
         members = bodies[:, :, : self.num_matched]
         cost = self.appearance_cost(some, target)
         with torch.no_grad():
-            poses, scales = self.anneal(some, members, target, cost)
             radii = body_radii(some.positions, members)
             smallest = self.min_scale * point_spacing(target.positions, target.mask)[:, None]
+            poses, scales = self._anneal(some, members, target, cost, radii, smallest)
             for _ in range(self.num_plane_rounds - 1):
                 poses, _ = self._plane_round(poses, some, members, target, cost, scales, radii, smallest)
         poses, belief = self._plane_round(poses, some, members, target, cost, scales, radii, smallest)
@@ -126,14 +127,12 @@ class FirstVelocity(nn.Module):
         displacements = share[..., None] * (current.positions - was) * bodies.any(dim=1)[..., None]
         return MatchedMotion(displacements, (bodies * (confidence * known)[..., None]).sum(dim=1))
 
-    @torch.no_grad()
-    def anneal(
-        self, some: Surfels, members: Float[Tensor, "batch body particle"], target: Surfels, cost: Tensor
+    def _anneal(
+        self, some: Surfels, members: Tensor, target: Surfels, cost: Tensor, radii: Tensor, smallest: Tensor
     ) -> tuple[Poses, Float[Tensor, "batch particle"]]:
         """Return the poses that soft matches of shrinking scale agree on, and the last scale (metres) of each point."""
-        radii, spacing = body_radii(some.positions, members), point_spacing(target.positions, target.mask)
         radius = (members * radii[..., None]).sum(dim=1)  # of each particle's body
-        poses, smallest = _unmoved(some.positions, members), self.min_scale * spacing[:, None]
+        poses = _unmoved(some.positions, members)
         for scale in self.match_scales:
             scales = torch.maximum(scale * radius, smallest).clamp(min=1e-9)
             matched, evidence, _ = match(poses.of(some.positions, members), target, cost, scales)
@@ -214,12 +213,24 @@ def match(
     at: Tensor, target: Surfels, cost: Tensor, scales: Float[Tensor, "batch particle"]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return soft matches (metres), their evidence (1 for one perfect match) and the index of the best one."""
-    square = (at[:, :, None] - target.positions[:, None]).square().sum(dim=-1)
+    origin = _masked_mean(target.positions, target.mask)
+    local, goals = at - origin, target.positions - origin
+    # The product form of the squared distance, two to three times faster than differences: about the middle of the
+    # scene its error is a millionth of the scene's width squared, against scales of a hundredth of it.
+    square = torch.baddbmm(goals.square().sum(dim=-1)[:, None], local, goals.mT, alpha=-2)
+    square = (square + local.square().sum(dim=-1)[..., None]).clamp(min=0)
     logits = -square / (2 * scales[..., None].square()) - cost
     # What is not there counts for nothing, and even where nothing is there the numbers stay finite.
     logits = logits.masked_fill(~target.mask[:, None], -1e4).clamp(min=-1e4)
-    matched = (torch.softmax(logits, dim=-1)[..., None] * target.positions[:, None]).sum(dim=-2)
-    return matched, torch.exp(torch.logsumexp(logits, dim=-1)), logits.argmax(dim=-1)
+    top, best = logits.detach().max(dim=-1, keepdim=True)
+    kernel = torch.exp(logits - top)
+    total = kernel.sum(dim=-1, keepdim=True)
+    return origin + (kernel @ goals) / total, (total * torch.exp(top)).squeeze(-1), best.squeeze(-1)
+
+
+def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean of the valid values, with the axis kept; zero where there is none."""
+    return (values * mask[..., None]).sum(dim=1, keepdim=True) / mask.sum(dim=1).clamp(min=1)[:, None, None]
 
 
 def believed(evidence: Tensor) -> Tensor:
@@ -254,10 +265,11 @@ def body_radii(positions: Tensor, members: Tensor) -> Float[Tensor, "batch body"
 
 
 def point_spacing(positions: Tensor, mask: Tensor) -> Float[Tensor, " batch"]:
-    """Return the median distance (metres) of a point to its fourth nearest, the measure of ``graph.bodies``."""
-    both = mask[:, :, None] & mask[:, None]
-    square = (positions[:, :, None] - positions[:, None]).square().sum(dim=-1).masked_fill(~both, torch.inf)
+    """Return the median distance (metres) of the first points to their fourth nearest, as in ``graph.bodies``."""
+    some, valid = positions[:, :_NUM_SPACED], mask[:, :_NUM_SPACED]
+    both = valid[:, :, None] & mask[:, None]
+    square = (some[:, :, None] - positions[:, None]).square().sum(dim=-1).masked_fill(~both, torch.inf)
     rank = min(5, positions.shape[1])  # itself is the nearest
     distances = square.topk(rank, dim=-1, largest=False).values[..., -1].sqrt()
-    usable = torch.where(mask & torch.isfinite(distances), distances, torch.nan)
+    usable = torch.where(valid & torch.isfinite(distances), distances, torch.nan)
     return torch.nan_to_num(usable.nanmedian(dim=1).values, nan=0.0)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.body_forces import BodyForces
-from vpd_lightning.dynamics.body_motion import BodyMotion, body_inertia
+from vpd_lightning.dynamics.body_motion import BodyMotion, body_inertia, matrices_of, vectors_of
 from vpd_lightning.dynamics.contact import (
     BodyContacts,
     ContactPoints,
@@ -31,6 +31,10 @@ _PAIR_REACH = 1.5
 """Spacings beside the nearest particle of another body within which that still says where its surface is."""
 
 
+_BOUNCE_SHARE = 0.3
+"""Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, or nothing would ever lie still."""
+
+
 @dataclass(frozen=True)
 class InertialMemory:
     """What the inertial dynamics carries from step to step; gathered over the particles that may move."""
@@ -38,6 +42,7 @@ class InertialMemory:
     index: Int[Tensor, "batch moving"]  # slots of the moving candidates among all particles
     mask: Bool[Tensor, "batch moving"]
     bodies: Float[Tensor, "batch body moving"]  # 1 where a particle belongs to a body, else 0
+    own: Int[Tensor, "batch moving"]  # the number of that body; 0 for padding
     motion: BodyMotion  # the velocity with which bodies go into the next step
     materials: Materials
     masses: Float[Tensor, "batch body 1"]
@@ -84,6 +89,7 @@ class InertialDynamics(AbstractDynamics):
         num_forces: int,
         location_scale: float,
         force_scale: float,
+        residual_share: float,
         contact_range: float,
         contact_reach: float,
         num_contact_iterations: int,
@@ -100,8 +106,10 @@ class InertialDynamics(AbstractDynamics):
         for name, scale in (("body_link", body_link), ("location_scale", location_scale), ("force_scale", force_scale)):
             if scale <= 0:
                 raise ValueError(f"{name} must be positive, got {scale}")
-        if rest_share < 0:
-            raise ValueError(f"rest_share must not be negative, got {rest_share}")
+        if rest_share < 0 or residual_share < 0:
+            raise ValueError(
+                f"rest_share and residual_share must not be negative, got {rest_share} and {residual_share}"
+            )
         self.num_bodies, self.num_probes = num_bodies, num_probes
         self.body_link, self.max_concavity, self.max_concave_share = body_link, max_concavity, max_concave_share
         self.force_scale, self.rest_share = force_scale, rest_share
@@ -110,13 +118,13 @@ class InertialDynamics(AbstractDynamics):
         self.mirror_hidden = mirror_hidden
         self.first_velocity = first_velocity
         self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
-        self.log_rest_speed = nn.Parameter(torch.tensor(0.3 * force_scale).log())
         self.forces = BodyForces(
             hidden_dim=hidden_dim,
             message_passing_steps=message_passing_steps,
             num_forces=num_forces,
             location_scale=location_scale,
             force_scale=force_scale,
+            residual_share=residual_share,
             contact_range=contact_range,
         )
         self.materials = MaterialNetwork(feature_dim=feature_dim, hidden_dim=hidden_dim, is_soft=is_soft)
@@ -158,7 +166,8 @@ class InertialDynamics(AbstractDynamics):
             max_concavity=self.max_concavity,
             max_concave_share=self.max_concave_share,
         )
-        numbers = torch.arange(self.num_bodies, device=labels.device)
+        # No more places than there are bodies: what follows costs as much for an empty one.
+        numbers = torch.arange(max(1, int(labels.max()) + 1), device=labels.device)
         bodies = (labels[:, None] == numbers[:, None]).to(current.positions.dtype)
         shares = bodies / bodies.sum(dim=-1, keepdim=True).clamp(min=1)
         displacements = torch.zeros_like(seen.positions)
@@ -177,6 +186,7 @@ class InertialDynamics(AbstractDynamics):
             index=index,
             mask=mask,
             bodies=bodies,
+            own=labels.clamp(min=0),
             motion=_first_motion(seen.positions, displacements, shares, centers),
             materials=materials,
             masses=materials.density * _volumes(seen.positions, centers, shares),
@@ -202,8 +212,8 @@ class InertialDynamics(AbstractDynamics):
     ) -> Bool[Tensor, "batch moving"]:
         """Return whose mirror image through the centre does not lie inside what stands still: nothing can be there."""
         mirrored = 2 * (bodies[..., None] * centers[:, :, None]).sum(dim=1) - seen.positions
-        statics = (_take(values, static_index) for values in (current.positions, current.normals))
-        return nearest_static_contacts(mirrored, *statics, static_mask, self.contact_reach).distances > 0
+        places, normals = _take(current.positions, static_index), _take(current.normals, static_index)  # type: ignore[arg-type]
+        return nearest_static_contacts(mirrored, places, normals, static_mask, self.contact_reach).distances > 0
 
     def forward(
         self, previous: Particles, current: Particles, memory: Any, keys: RandomKeys, rollout_step: int
@@ -221,12 +231,11 @@ class InertialDynamics(AbstractDynamics):
         static_positions = _take(current.positions, memory.static_index)
         resolved = self._resolved(positions, static_positions, current.normals, memory)  # type: ignore[arg-type]
         step, onward = self._rested(resolved)
-        moved = step.centers[:, :, None] + step.displacements[:, :, None]
-        moved = moved + step.turned(positions[:, None] - step.centers[:, :, None])
-        owned = memory.bodies[..., None]
-        following = torch.where(memory.mask[..., None], (owned * moved).sum(dim=1), positions)
-        rotations = rotation_from_spin(step.spins)
-        turned = (owned * rotate(rotations[:, :, None], memory.normals[:, None])).sum(dim=1)
+        own = memory.own
+        moved = vectors_of(step.centers + step.displacements, own)
+        moved = moved + step.turned(positions - vectors_of(step.centers, own), own)
+        following = torch.where(memory.mask[..., None], moved, positions)
+        turned = rotate(matrices_of(rotation_from_spin(step.spins), own), memory.normals)
         all_positions = _put(current.positions, memory.index, following, memory.mask)
         features = self._shade(current, memory, static_positions, following, turned)
         stretches, _ = step.following_stretches()
@@ -246,14 +255,15 @@ class InertialDynamics(AbstractDynamics):
         inertia = body_inertia(
             positions, memory.motion.centers, shares, materials.softness, self.log_inertia_ratio.exp()
         )
-        offsets = probe_positions[:, None] - memory.motion.centers[:, :, None]
-        moved = memory.motion.displacements[:, :, None] + memory.motion.turned(offsets) - offsets
+        own = memory.own[:, probes]
+        offsets = probe_positions - vectors_of(memory.motion.centers, own)
+        moved = vectors_of(memory.motion.displacements, own) + memory.motion.turned(offsets, own) - offsets
         statics = (static_positions, _take(normals, memory.static_index), memory.static_mask, self.contact_reach)
         points = self._contact_points(probe_positions, memory, members)
         contacts = nearest_static_contacts(points.positions, *statics)
         motion = self.forces(
             probe_positions,
-            (members[..., None] * moved).sum(dim=1),
+            moved * memory.mask[:, probes, None],
             contacts.first(probe_positions.shape[1]),
             memory.mask[:, probes],
             members,
@@ -263,10 +273,11 @@ class InertialDynamics(AbstractDynamics):
         motion = replace(motion, strains=_elastic(motion, materials))
         solver = ContactSolver(
             points=points,
+            centers=memory.motion.centers,
             inertia=inertia,
             materials=materials,
             masses=memory.masses,
-            rest_speed=self.log_rest_speed.exp(),
+            rest_speed=_BOUNCE_SHARE * self.force_scale,
         )
         return solver.resolve(
             motion,
@@ -284,7 +295,7 @@ class InertialDynamics(AbstractDynamics):
         normals = memory.normals[:, : self.num_probes]
         if not self.mirror_hidden:
             return ContactPoints(positions, normals, members)
-        centers = (members[..., None] * memory.motion.centers[:, :, None]).sum(dim=1)
+        centers = vectors_of(memory.motion.centers, memory.own[:, : self.num_probes])
         mirrored = members * memory.mirrored[:, None, : self.num_probes]
         return ContactPoints(
             torch.cat([positions, 2 * centers - positions], dim=1),
@@ -337,8 +348,13 @@ class InertialDynamics(AbstractDynamics):
 def _surfels(particles: Particles, index: Tensor, mask: Tensor) -> Surfels:
     colors, normals = particles.colors, particles.normals
     assert colors is not None and normals is not None
-    taken = [_take(values, index) for values in (particles.positions, colors, normals, particles.features)]
-    return Surfels(*taken, mask)
+    return Surfels(
+        positions=_take(particles.positions, index),
+        colors=_take(colors, index),
+        normals=_take(normals, index),
+        features=_take(particles.features, index),
+        mask=mask,
+    )
 
 
 def _first_motion(positions: Tensor, displacements: Tensor, shares: Tensor, centers: Tensor) -> BodyMotion:

@@ -66,7 +66,7 @@ class WideSurfaceBackground(AbstractBackground):
         return torch.from_numpy(np.unpackbits(packed, count=shape.numel()).astype(bool).reshape(tuple(shape)))
 
     def _loose(self, frames: RGBDFrames) -> np.ndarray:
-        frames = frames.to("cpu", torch.float64)
+        frames = frames.to("cpu", torch.float32)
         depth = torch.nan_to_num(frames.depth, nan=0.0, posinf=0.0, neginf=0.0)
         valid = depth > 0
         intrinsics = frames.cameras.intrinsics
