@@ -32,7 +32,7 @@ _PAIR_REACH = 1.5
 
 
 _BOUNCE_SHARE = 0.3
-"""Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, or nothing would ever lie still."""
+"""Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, or nothing ever lay still."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,12 @@ from torch import Tensor
 _SPACING_RANK = 4
 """The distance to this many-th nearest particle is what is called spacing: one missing neighbour hardly changes it."""
 
+_SPARSEST = 2.5
+"""How many times the usual spacing particles may lie apart where cameras see a surface from the side."""
+
+_PART_SHARE = 0.08
+"""An island of at most this share of another one may be a sparsely seen part of it."""
+
 _MIN_PARTICLES, _MIN_SHARE = 8, 0.0125
 """An island of fewer particles is no body. One of a smaller share of all is one only if no other island is near."""
 
@@ -32,6 +38,7 @@ def label_bodies(
     hollow: (n_i - n_j) . (x_i - x_j) / |x_i - x_j| is at least ``-max_concavity`` (after the convexity criterion of
     Stein et al. 2014, "Object partitioning using local convexity"). Bodies that touch meet in a hollow. A particle with
     more than ``max_concave_share`` of hollow pairs links with none: in a touch there may be a single pair that is not.
+    Islands between which most pairs are not hollow are joined again.
     What is in no island of some size, and islands beyond ``num_bodies``, joins the nearest body. Scene by scene, on
     the CPU; the numbers do not depend on the order of the particles, on the place of the world or its scale.
     """
@@ -47,6 +54,29 @@ def label_bodies(
     return labels.to(mask.device)
 
 
+def _islands(senders: np.ndarray, receivers: np.ndarray, count: int) -> np.ndarray:
+    links = coo_array((np.ones(len(senders), bool), (senders, receivers)), shape=(count, count))
+    return connected_components(links, directed=False)[1]
+
+
+def _joined(
+    islands: np.ndarray, senders: np.ndarray, receivers: np.ndarray, smooth: np.ndarray, max_share: float
+) -> np.ndarray:
+    """Join islands between which most pairs of particles are not hollow: parts of one body.
+
+    One of the two must have at most ``max_share`` of the particles of the other.
+    """
+    count, sizes = islands.max() + 1, np.bincount(islands)
+    across = islands[senders] != islands[receivers]
+    low = np.minimum(islands[senders[across]], islands[receivers[across]])
+    high = np.maximum(islands[senders[across]], islands[receivers[across]])
+    pairs, which = np.unique(low * count + high, return_inverse=True)
+    low, high = np.divmod(pairs, count)
+    share = np.bincount(which, smooth[across], minlength=len(pairs)) / np.bincount(which, minlength=len(pairs)).clip(1)
+    join = (share > 0.5) & (np.minimum(sizes[low], sizes[high]) <= max_share * np.maximum(sizes[low], sizes[high]))
+    return _islands(low[join], high[join], count)[islands]
+
+
 def _label(
     points: np.ndarray,
     normals: np.ndarray,
@@ -60,20 +90,28 @@ def _label(
     rank = min(_SPACING_RANK, count - 1)
     if rank < 1:
         return np.zeros(count, dtype=np.int64)
-    spacing = np.median(tree.query(points, k=[rank + 1])[0])
-    senders, receivers = tree.query_pairs(link * spacing * (1 + 1e-9), output_type="ndarray").T
+    spacing = tree.query(points, k=[rank + 1])[0][:, 0]
+    usual = np.median(spacing)
+    spacing = spacing.clip(usual, _SPARSEST * usual)
+    senders, receivers = tree.query_pairs(link * spacing.max() * (1 + 1e-9), output_type="ndarray").T
     steps = points[senders] - points[receivers]
     lengths = np.sqrt((steps**2).sum(axis=-1)).clip(min=np.finfo(float).tiny)
+    near = lengths <= link * np.minimum(spacing[senders], spacing[receivers]) * (1 + 1e-9)
+    senders, receivers, steps, lengths = senders[near], receivers[near], steps[near], lengths[near]
     turn = ((normals[senders] - normals[receivers]) * steps).sum(axis=-1) / lengths
     known = (normals**2).sum(axis=-1) > 0.5
     smooth = known[senders] & known[receivers] & (turn > -max_concavity)
 
-    pairs = np.bincount(np.r_[senders, receivers], minlength=count)
-    hollow = np.bincount(np.r_[senders[~smooth], receivers[~smooth]], minlength=count)
+    usual_pair = lengths <= link * usual * (1 + 1e-9)
+    first, second, convex = senders[usual_pair], receivers[usual_pair], smooth[usual_pair]
+    pairs = np.bincount(np.r_[first, second], minlength=count)
+    hollow = np.bincount(np.r_[first[~convex], second[~convex]], minlength=count)
     clean = hollow <= max_concave_share * pairs
-    smooth &= clean[senders] & clean[receivers]
-    links = coo_array((np.ones(smooth.sum(), bool), (senders[smooth], receivers[smooth])), shape=(count, count))
-    _, islands = connected_components(links, directed=False)
+    sure = convex & clean[first] & clean[second]
+    islands = _islands(first[sure], second[sure], count)
+    islands = _joined(islands, first, second, convex, 1.0)
+    # Where a surface is seen from the side its points lie wide apart: such parts belong to a body, but are none.
+    islands = _joined(islands, senders, receivers, smooth, _PART_SHARE)
 
     sizes = np.bincount(islands)
     centers = np.stack([np.bincount(islands, points[:, axis]) for axis in range(3)], axis=-1) / sizes[:, None]
