@@ -69,8 +69,8 @@ SCENE = [
     "data.folder=nowhere",
     "run.folder=nowhere",
 ]
-# InertialDynamics sees the first num_probes and num_matched slots of what may move; beyond them the order of particles
-# does matter, so both stay above 20 here.
+# InertialDynamics sees the first num_probes and num_matched slots of what may move, VelocityGNNDynamics the latter;
+# beyond them the order of particles does matter, so both stay above 20 here.
 
 # What a class cannot satisfy, by its name, so that a new option of the same class needs no entry.
 DEPARTURES = {
@@ -89,11 +89,14 @@ DEPARTURES = {
     "HierarchicalGNNDynamics": {
         "test_order_of_particles_does_not_matter": "abstract nodes are drawn among the slots of the current particles"
     },
+    "VelocityGNNDynamics": {
+        "test_order_of_particles_does_not_matter": "it wraps the graph network, whose abstract nodes are drawn so"
+    },
     "SleepingDynamics": {
         "test_order_of_particles_does_not_matter": "it wraps the graph network, whose abstract nodes are drawn so"
     },
 }
-NEEDS_OBSERVATIONS = {"InertialDynamics"}
+NEEDS_OBSERVATIONS = {"InertialDynamics", "VelocityGNNDynamics"}
 
 
 def options(group: str) -> list[str]:
@@ -151,6 +154,7 @@ class TestPaperDynamicsWithoutDraws(TestDynamics):
         self.choose(request.param)
         self.section["num_abstract_nodes"] = 64
         self.departures = {}
+        self.needs_observations = self.class_name in NEEDS_OBSERVATIONS
 
 
 class TestRenderers(ChosenOption, RendererContract):

@@ -56,6 +56,10 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {  # switches that change how a
         "static_shapes": {"edge_capacity": 512},
         "nearest_abstract_nodes": {"max_abstract_edges_per_node": 4},
     },
+    "hierarchical_gnn_velocity": {
+        "static_shapes": {"edge_capacity": 512},
+        "as_an_input_only": {"adds_velocity": False},
+    },
 }
 
 

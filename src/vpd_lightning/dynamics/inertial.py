@@ -1,7 +1,7 @@
 """Inertial dynamics: what moves keeps moving, as rigid or soft bodies; networks learn forces and materials."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -19,13 +19,13 @@ from vpd_lightning.dynamics.contact import (
     nearest_body_contacts,
     nearest_static_contacts,
 )
+from vpd_lightning.dynamics.first_motion import find_first_motion, gather_index, movable, observed, put, take
 from vpd_lightning.dynamics.first_velocity import FirstVelocity, Surfels, point_spacing
 from vpd_lightning.dynamics.materials import MaterialNetwork, Materials
 from vpd_lightning.dynamics.rigid_motion import equidistant_centers, fit_twists, rotate, rotation_from_spin
 from vpd_lightning.dynamics.shading import MovingShading, StaticShading
-from vpd_lightning.graph.bodies import label_bodies
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles, require_finite
+from vpd_lightning.types import Particles
 
 _PAIR_REACH = 1.5
 """Spacings beside the nearest particle of another body within which that still says where its surface is."""
@@ -131,53 +131,28 @@ class InertialDynamics(AbstractDynamics):
         self.moving_shading = MovingShading(feature_dim=feature_dim, hidden_dim=hidden_dim)
         self.static_shading = StaticShading(feature_dim=feature_dim, hidden_dim=hidden_dim, scales=shadow_scales)
 
-    @staticmethod
-    def _movable(particles: Particles) -> Tensor:
-        return particles.mask if particles.moving is None else particles.mask & particles.moving
-
     def initialize(self, previous: Particles, current: Particles, keys: RandomKeys) -> InertialMemory:
         """Divide what may move into bodies, and estimate their first velocities."""
-        for particles in (previous, current):
-            if particles.colors is None or particles.normals is None:
-                raise ValueError(
-                    "the inertial dynamics needs observed colors and normals; set encoder.use_normals=true"
-                )
-        previous, current = previous.without_padding(), current.without_padding()
-        require_finite(
-            "Dynamics",
-            positions=torch.cat([previous.positions, current.positions], dim=1),
-            features=current.features,
-            colors=torch.cat([previous.colors, current.colors], dim=1),  # type: ignore[list-item]
-            normals=torch.cat([previous.normals, current.normals], dim=1),  # type: ignore[list-item]
-        )
+        previous, current = observed(previous, current)
         with torch.autocast(current.positions.device.type, enabled=False):  # geometry in full precision
-            return self._first_memory(_with_a_slot(previous), _with_a_slot(current))
+            return self._first_memory(previous, current)
 
     def _first_memory(self, previous: Particles, current: Particles) -> InertialMemory:
-        movable = self._movable(current)
-        index, mask = _gather_index(movable)
-        seen = _surfels(current, index, mask)
-        labels = label_bodies(
-            seen.positions,
-            seen.normals,
-            mask,
+        found = find_first_motion(
+            previous,
+            current,
             num_bodies=self.num_bodies,
-            link=self.body_link,
+            body_link=self.body_link,
             max_concavity=self.max_concavity,
             max_concave_share=self.max_concave_share,
+            first_velocity=self.first_velocity,
         )
-        # No more places than there are bodies: what follows costs as much for an empty one.
-        numbers = torch.arange(max(1, int(labels.max()) + 1), device=labels.device)
-        bodies = (labels[:, None] == numbers[:, None]).to(current.positions.dtype)
+        index, mask, seen, bodies = found.index, found.mask, found.seen, found.bodies
         shares = bodies / bodies.sum(dim=-1, keepdim=True).clamp(min=1)
-        displacements = torch.zeros_like(seen.positions)
-        if self.first_velocity is not None:
-            before = _surfels(previous, *_gather_index(self._movable(previous)))
-            displacements = self.first_velocity(seen, bodies, before).displacements
         with torch.no_grad():
             centers = equidistant_centers(seen.positions, seen.normals, shares)
-            static_index, static_mask = _gather_index(current.mask & ~movable)
-            static_positions = _take(current.positions, static_index)
+            static_index, static_mask = gather_index(current.mask & ~movable(current))
+            static_positions = take(current.positions, static_index)
             surroundings = self.static_shading.surroundings(static_positions, seen.positions, mask)
             mirrored = mask & self._may_be_hidden(current, seen, bodies, centers, static_index, static_mask)
             spacing = point_spacing(seen.positions, mask)
@@ -186,8 +161,8 @@ class InertialDynamics(AbstractDynamics):
             index=index,
             mask=mask,
             bodies=bodies,
-            own=labels.clamp(min=0),
-            motion=_first_motion(seen.positions, displacements, shares, centers),
+            own=found.own,
+            motion=_first_motion(seen.positions, found.matched.displacements, shares, centers),
             materials=materials,
             masses=materials.density * _volumes(seen.positions, centers, shares),
             spacing=spacing,
@@ -197,7 +172,7 @@ class InertialDynamics(AbstractDynamics):
             first_normals=seen.normals,
             static_index=static_index,
             static_mask=static_mask,
-            static_features=_take(current.features, static_index),
+            static_features=take(current.features, static_index),
             static_surroundings=surroundings,
         )
 
@@ -212,7 +187,7 @@ class InertialDynamics(AbstractDynamics):
     ) -> Bool[Tensor, "batch moving"]:
         """Return whose mirror image through the centre does not lie inside what stands still: nothing can be there."""
         mirrored = 2 * (bodies[..., None] * centers[:, :, None]).sum(dim=1) - seen.positions
-        places, normals = _take(current.positions, static_index), _take(current.normals, static_index)  # type: ignore[arg-type]
+        places, normals = take(current.positions, static_index), take(current.normals, static_index)  # type: ignore[arg-type]
         return nearest_static_contacts(mirrored, places, normals, static_mask, self.contact_reach).distances > 0
 
     def forward(
@@ -227,8 +202,8 @@ class InertialDynamics(AbstractDynamics):
             return self._step(current, memory)
 
     def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
-        positions = _take(current.positions, memory.index)
-        static_positions = _take(current.positions, memory.static_index)
+        positions = take(current.positions, memory.index)
+        static_positions = take(current.positions, memory.static_index)
         resolved = self._resolved(positions, static_positions, current.normals, memory)  # type: ignore[arg-type]
         step, onward = self._rested(resolved)
         own = memory.own
@@ -236,7 +211,7 @@ class InertialDynamics(AbstractDynamics):
         moved = moved + step.turned(positions - vectors_of(step.centers, own), own)
         following = torch.where(memory.mask[..., None], moved, positions)
         turned = rotate(matrices_of(rotation_from_spin(step.spins), own), memory.normals)
-        all_positions = _put(current.positions, memory.index, following, memory.mask)
+        all_positions = put(current.positions, memory.index, following, memory.mask)
         features = self._shade(current, memory, static_positions, following, turned)
         stretches, _ = step.following_stretches()
         _, strains = onward.following_stretches()
@@ -258,7 +233,7 @@ class InertialDynamics(AbstractDynamics):
         own = memory.own[:, probes]
         offsets = probe_positions - vectors_of(memory.motion.centers, own)
         moved = vectors_of(memory.motion.displacements, own) + memory.motion.turned(offsets, own) - offsets
-        statics = (static_positions, _take(normals, memory.static_index), memory.static_mask, self.contact_reach)
+        statics = (static_positions, take(normals, memory.static_index), memory.static_mask, self.contact_reach)
         points = self._contact_points(probe_positions, memory, members)
         contacts = nearest_static_contacts(points.positions, *statics)
         motion = self.forces(
@@ -341,20 +316,8 @@ class InertialDynamics(AbstractDynamics):
         surroundings = self.static_shading.surroundings(static_positions, following, memory.mask)
         static = memory.static_features
         static = static + self.static_shading(static, memory.static_surroundings, surroundings)
-        features = _put(current.features, memory.index, moving, memory.mask)
-        return _put(features, memory.static_index, static, memory.static_mask)
-
-
-def _surfels(particles: Particles, index: Tensor, mask: Tensor) -> Surfels:
-    colors, normals = particles.colors, particles.normals
-    assert colors is not None and normals is not None
-    return Surfels(
-        positions=_take(particles.positions, index),
-        colors=_take(colors, index),
-        normals=_take(normals, index),
-        features=_take(particles.features, index),
-        mask=mask,
-    )
+        features = put(current.features, memory.index, moving, memory.mask)
+        return put(features, memory.static_index, static, memory.static_mask)
 
 
 def _first_motion(positions: Tensor, displacements: Tensor, shares: Tensor, centers: Tensor) -> BodyMotion:
@@ -389,29 +352,3 @@ def _elastic(motion: BodyMotion, materials: Materials) -> Float[Tensor, "batch b
     eye = torch.eye(3, dtype=motion.strains.dtype, device=motion.strains.device)
     carried = motion.strains * (1 - materials.damping)[..., None]
     return carried - materials.stiffness[..., None] * (motion.stretches - eye)
-
-
-def _with_a_slot(particles: Particles) -> Particles:
-    """Return the particles with one slot of padding where they have no slots at all."""
-    if particles.num_particles > 0:
-        return particles
-    slots = {item.name: getattr(particles, item.name) for item in fields(particles)}
-    shapes = {name: (len(value), 1, *value.shape[2:]) for name, value in slots.items() if value is not None}
-    return Particles(**{name: slots[name].new_zeros(shape) for name, shape in shapes.items()})
-
-
-def _gather_index(chosen: Bool[Tensor, "batch particle"]) -> tuple[Tensor, Tensor]:
-    """Return slots of the chosen particles, packed to the largest count of the batch (at least one), and a mask."""
-    count = max(1, int(chosen.sum(dim=1).max()))
-    index = torch.sort((~chosen).to(torch.uint8), dim=1, stable=True).indices[:, :count]
-    return index, torch.gather(chosen, 1, index)
-
-
-def _take(values: Tensor, index: Tensor) -> Tensor:
-    return torch.gather(values, 1, index[..., None].expand(-1, -1, values.shape[-1]))
-
-
-def _put(values: Tensor, index: Tensor, new: Tensor, mask: Tensor) -> Tensor:
-    """Return ``values`` with ``new`` at the valid slots; the others keep what they had, bit for bit."""
-    new = torch.where(mask[..., None], new, _take(values, index))
-    return values.scatter(1, index[..., None].expand_as(new), new)
