@@ -37,7 +37,7 @@ def observed(previous: Particles, current: Particles) -> tuple[Particles, Partic
     require_finite(
         "Dynamics",
         positions=torch.cat([previous.positions, current.positions], dim=1),
-        features=current.features,
+        features=torch.cat([previous.features, current.features], dim=1),
         colors=torch.cat([previous.colors, current.colors], dim=1),  # type: ignore[list-item]
         normals=torch.cat([previous.normals, current.normals], dim=1),  # type: ignore[list-item]
     )

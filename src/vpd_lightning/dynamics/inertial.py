@@ -217,7 +217,9 @@ class InertialDynamics(AbstractDynamics):
         _, strains = onward.following_stretches()
         onward = BodyMotion(step.centers + step.displacements, onward.displacements, onward.spins, stretches, strains)
         memory = replace(memory, motion=onward, normals=turned)
-        return replace(current, positions=all_positions, features=features), memory
+        # Observations turn with their bodies, or a memory built from these particles would see faces that are gone.
+        normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
+        return replace(current, positions=all_positions, features=features, normals=normals), memory
 
     def _resolved(
         self, positions: Tensor, static_positions: Tensor, normals: Tensor, memory: InertialMemory

@@ -66,7 +66,7 @@ def _joined(
 
     One of the two must have at most ``max_share`` of the particles of the other.
     """
-    count, sizes = islands.max() + 1, np.bincount(islands)
+    count, sizes = int(islands.max()) + 1, np.bincount(islands)
     across = islands[senders] != islands[receivers]
     low = np.minimum(islands[senders[across]], islands[receivers[across]])
     high = np.maximum(islands[senders[across]], islands[receivers[across]])
