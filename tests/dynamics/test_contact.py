@@ -70,7 +70,9 @@ def one(value, count=1):
     return torch.full((1, count, 1), value, dtype=torch.float64)
 
 
-def resolve(distances, *, num_iterations=1, inverse_inertia=100.0, friction=0.0, restitution=0.0, velocity=(0, 0, -0.1)):
+def resolve(
+    distances, *, num_iterations=1, inverse_inertia=100.0, friction=0.0, restitution=0.0, velocity=(0, 0, -0.1)
+):
     """Three points of a body around the origin that moves down, at given distances from a floor."""
     zero = torch.zeros(1, 1, 3, dtype=torch.float64)
     free = BodyMotion(zero, torch.tensor([[velocity]], dtype=torch.float64), zero, EYE[None, None], 0 * EYE[None, None])
@@ -238,9 +240,7 @@ def test_a_tilted_cube_falls_onto_a_face():
 
 @pytest.mark.parametrize("softness", [0.1, 1.0])
 def test_a_soft_ball_is_flattened_and_comes_round_again(softness):
-    world = World(
-        [ball_with_poles()], [(0, 0, 0.16)], [(0, 0, -0.04)], softness=softness, restitution=0.2, damping=0.4
-    )
+    world = World([ball_with_poles()], [(0, 0, 0.16)], [(0, 0, -0.04)], softness=softness, restitution=0.2, damping=0.4)
     flattest = 0.0
     for _ in range(25):
         world.step()
