@@ -242,7 +242,9 @@ class ContactSolver:
         usable = contacts.known[:, None, None] & from_first & to_second  # batch body body probe
         deepest, probe = gaps[:, None, None].expand(usable.shape).masked_fill(~usable, torch.inf).min(dim=-1)
         depth, probe = torch.relu(-deepest).flatten(1)[..., None], probe.flatten(1)
-        first, second = (index.expand(len(own), -1) for index in (bodies.repeat_interleave(count), bodies.repeat(count)))
+        first, second = (
+            index.expand(len(own), -1) for index in (bodies.repeat_interleave(count), bodies.repeat(count))
+        )
         # Both bodies are pushed at one place, between the two points: at two, they would be turned out of nothing.
         place = (_points(there, probe) + _points(there, torch.gather(contacts.other, 1, probe))) / 2
         centers = motion.centers + motion.displacements
