@@ -15,6 +15,7 @@ from vpd_lightning.dynamics.rigid_motion import (
     rotation_from_spin,
 )
 
+
 def test_spin_is_twice_the_tangent_of_half_the_angle():
     axis, angle = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64), 0.7
 
