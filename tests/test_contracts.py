@@ -34,7 +34,7 @@ from vpd_lightning.testing import (
     LossContract,
     RendererContract,
 )
-from vpd_lightning.types import SimulatorOutput, VideoBatch
+from vpd_lightning.types import Particles, SimulatorOutput, VideoBatch
 
 # Any option may hold any of these; where it does, the test takes the small value. All else stays as the file says.
 SMALL = {
@@ -57,6 +57,7 @@ SMALL = {
     "num_fine_samples": 12,
     "background_width": 8,
     "ray_chunk_size": 10,  # fewer than the rays of a check, so that chunks are joined
+    "force_scale": 0.03,  # metres: the ball of the checks falls fast enough to bounce
     "initial_depth": 1.4,  # from the cameras of the checks to the middle of the scene
 }
 SCENE = [
@@ -145,6 +146,19 @@ class TestDynamics(ChosenOption, DynamicsContract):
         self.choose(request.param)
         self.needs_observations = self.class_name in NEEDS_OBSERVATIONS
 
+    def particles(self, *sizes: int, **named: int) -> tuple[Particles, Particles]:
+        """Return particles whose balls strike the floor where a dynamics has weights that only an impact reaches."""
+        previous, current = super().particles(*sizes, **named)
+        if self.class_name not in NEEDS_OBSERVATIONS:
+            return previous, current
+        return _lowered(previous), _lowered(current)
+
+
+def _lowered(particles: Particles) -> Particles:
+    assert particles.moving is not None
+    fall = 0.12 * particles.moving[..., None] * torch.tensor([0.0, 0.0, 1.0]).to(particles.positions)
+    return replace(particles, positions=particles.positions - fall)
+
 
 class TestPaperDynamicsWithoutDraws(TestDynamics):
     """With as many abstract nodes as particles nothing is drawn, and the paper's network departs from nothing."""
@@ -187,8 +201,17 @@ class TestLosses(ChosenOption, LossContract):
         auxiliary["point_mass"] = torch.rand(*shape, 5, **draw)
         for name in ("previous_view_features", "view_features"):
             auxiliary[name] = torch.randn(shape[0], 3, 4, **draw)
+        for name in ("future_positions", "future_colors"):
+            auxiliary[name] = torch.rand(*shape, 7, 3, **draw) - 0.5
+        auxiliary["future_mask"] = torch.rand(*shape, 7, **draw) < 0.7
         auxiliary["predicted_depth"] = 1 + torch.rand(batch.context.depth[:, 1].shape, **draw)
-        return replace(made, auxiliary={name: value.to(batch.rgbs) for name, value in auxiliary.items()})
+        return replace(
+            made,
+            auxiliary={
+                name: value.to(batch.rgbs) if value.is_floating_point() else value.to(batch.rgbs.device)
+                for name, value in auxiliary.items()
+            },
+        )
 
 
 # The contracts themselves: each fault must be found by the check that is named beside it.

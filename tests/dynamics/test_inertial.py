@@ -4,36 +4,57 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.dynamics.test_rigid_motion import cube, random_toss, rotation_about
+from tests.dynamics.solids import ball, cube, random_rotation, rotation_about
+from vpd_lightning.dynamics.first_velocity import FirstVelocity
 from vpd_lightning.dynamics.inertial import InertialDynamics
 from vpd_lightning.dynamics.rigid_motion import rotation_from_spin
 from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.testing.contract import tensors_of
 from vpd_lightning.types import Particles
 
 SETTINGS = {
     "feature_dim": 4,
     "hidden_dim": 16,
-    "num_anchors": 3,
-    "anchor_radius": 0.5,
-    "body_radius": 2.0,
+    "num_bodies": 3,
+    "body_link": 1.7,
+    "max_concavity": 0.15,
+    "max_concave_share": 0.35,
     "num_probes": 32,
     "message_passing_steps": 2,
     "num_forces": 2,
     "location_scale": 0.3,
+    "force_scale": 0.1,
     "contact_range": 0.5,
     "contact_reach": 5.0,
     "num_contact_iterations": 4,
     "max_contact_depth": 0.06,
-    "match_scales": [0.12, 0.07, 0.04, 0.025, 0.015],
-    "match_color_scale": 0.05,
-    "match_radius": 0.3,
-    "num_matched": 120,
+    "mirror_hidden": True,
+    "is_soft": False,
+    "rest_share": 0.05,
     "shadow_scales": [0.1, 0.4],
 }
+FIRST_VELOCITY = {
+    "match_scales": [0.8, 0.5, 0.3, 0.18, 0.12, 0.08],
+    "min_scale": 0.3,
+    "color_scale": 0.05,
+    "feature_scale": None,
+    "num_matched": 120,
+    "num_plane_rounds": 3,
+    "tangential_weight": 0.05,
+    "rest_weight": 0.03,
+}
+GRAVITY = 0.0245  # metres a step squared: 9.81 m/s^2 at 20 frames/s
 
 
 def dynamics(**changes):
-    return InertialDynamics(**{**SETTINGS, **changes}).double()
+    return InertialDynamics(**{**SETTINGS, "first_velocity": FirstVelocity(**FIRST_VELOCITY), **changes}).double()
+
+
+def fall(model):
+    """Let the model's forces be weight alone."""
+    with torch.no_grad():
+        model.forces.weight.bias[2] = -math.atanh(GRAVITY / SETTINGS["force_scale"])
+    return model
 
 
 def floor(count, seed=9):
@@ -58,13 +79,22 @@ def scene(body, body_colors, body_normals, height=0.8, num_floor=50):
     )
 
 
+def random_toss(seed):
+    """A cube seen twice, by points drawn independently; also its spin and shift in between."""
+    seen, seen_colors, seen_normals = cube(400, seed=10 + seed)
+    points, colors, normals = cube(200, seed=30 + seed)
+    start = random_rotation(seed)
+    generator = torch.Generator().manual_seed(seed)
+    spin = (torch.rand(3, generator=generator, dtype=torch.float64) * 2 - 1) * 0.3  # up to 6 rad/s at 20 frames/s
+    shift = (torch.rand(3, generator=generator, dtype=torch.float64) * 2 - 1) * 0.05
+    turn = rotation_from_spin(spin)
+    before = seen @ start.T, seen_colors, seen_normals @ start.T
+    return before, (points @ (turn @ start).T + shift, colors, normals @ (turn @ start).T), (start, turn, shift, points)
+
+
 def tossed(seed=0):
-    previous, previous_colors, current, colors, _ = random_toss(seed)
-    normals = cube(200, seed=30 + seed)[2]
-    return (
-        scene(previous, previous_colors, torch.zeros_like(previous)),
-        scene(current, colors, normals),
-    )
+    before, now, _ = random_toss(seed)
+    return scene(*before), scene(*now)
 
 
 def pairwise(points):
@@ -93,28 +123,39 @@ def test_untrained_it_continues_the_motion_and_keeps_the_body_rigid():
     assert (centers[1:] - centers[:-1]).norm(dim=-1).min() > 0.005
 
 
-def test_a_free_spinning_cube_is_followed_around_its_true_centre():
-    points, colors, normals = cube(200, seed=4)
-    spin = torch.tensor([0.2, -0.1, 0.25], dtype=torch.float64)
-    turn, shift = rotation_from_spin(spin), torch.tensor([0.03, 0.0, -0.02], dtype=torch.float64)
-    model = dynamics(num_matched=200)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_tossed_cube_flies_on_as_it_came(seed):
+    before, now, (start, turn, shift, points) = random_toss(seed)
+    model = dynamics()
     torch.nn.init.constant_(model.forces.damping.bias, 30.0)  # no damping at all
-    previous = scene(points, colors, normals)
-    current = scene(points @ turn.T + shift, colors, normals @ turn.T)
-    keys = RandomKeys.fixed(1)
-    memory = model.initialize(previous, current, keys)
-    true_displacement = (points @ turn.T + shift) - points
-    memory = replace(memory, displacements=true_displacement[memory.index], center_displacements=shift.expand(1, 3, 3))
 
-    errors = []
-    for step in range(8):
-        current, memory = model(previous, current, memory, keys, step)
-        power = torch.linalg.matrix_power(turn, step + 2)
-        true = points @ power.T + (step + 2) * shift
-        true[:, 2] += 0.8
-        errors.append((current.positions[0, :200] - true).norm(dim=-1).mean())
+    states = roll(model, scene(*before), scene(*now), 8)
 
-    assert errors[-1] < 0.012  # of a body 30 cm wide that turned by 150 degrees
+    # A point of the body at step n is at turn^(n + 1) (start x) + (n + 1) shift: turned about the true centre.
+    power = torch.linalg.matrix_power(turn, 9)
+    true = points @ (power @ start).T + 9 * shift
+    true[:, 2] += 0.8
+    error = (states[-1].positions[0, :200] - true).norm(dim=-1).mean()
+    # of a body 30 cm wide that went up to 45 cm and turned by up to 150 degrees; its centre is known to a centimetre
+    assert error < 0.03
+
+
+def test_a_body_that_was_not_seen_before_starts_at_rest():
+    _, now, _ = random_toss(0)
+    current = scene(*now)
+    elsewhere = replace(current, positions=current.positions + torch.tensor([30.0, 0.0, 0.0]).double())
+
+    states = roll(dynamics(), elsewhere, current, 3)
+
+    assert (states[-1].positions - current.positions).norm(dim=-1).max() < 1e-3
+
+
+def test_without_a_first_velocity_bodies_start_at_rest():
+    previous, current = tossed()
+
+    states = roll(dynamics(first_velocity=None), previous, current, 3)
+
+    assert torch.allclose(states[-1].positions, current.positions, atol=1e-12)
 
 
 def test_what_is_no_candidate_stays_exactly_where_it_is():
@@ -142,13 +183,11 @@ def test_a_body_at_rest_without_forces_stays_at_rest():
 
 def falling(height, speed, angle, steps, **changes):
     """Roll a cube that moves down ``speed`` metres a step, turned by ``angle`` about y, from ``height``."""
-    points, colors, normals = cube(300, seed=5)
+    points, colors, normals = cube(150, seed=5)
     turn = rotation_about([0, 1, 0], angle)
-    now = scene(points @ turn.T, colors, normals @ turn.T, height=height, num_floor=400)
-    before = scene(points @ turn.T, colors, normals @ turn.T, height=height + speed, num_floor=400)
-    model = dynamics(num_anchors=1, num_probes=300, num_matched=300, **changes)
-    with torch.no_grad():  # gravity of 2.5 cm a step, as 9.81 m/s^2 at 20 frames/s
-        model.forces.weight.bias[2] = -math.atanh(0.0245 / SETTINGS["location_scale"])
+    now = scene(points @ turn.T, colors, normals @ turn.T, height=height, num_floor=100)
+    before = scene(points @ turn.T, colors, normals @ turn.T, height=height + speed, num_floor=100)
+    model = fall(dynamics(num_probes=150, **changes))
     return roll(model, before, now, steps), now
 
 
@@ -161,6 +200,31 @@ def test_a_falling_body_stops_on_the_floor_and_stays_there():
     heights = states[-1].positions[0, body, 2]
     assert 0.27 < heights.max() < 0.33  # a cube of 30 cm on one of its faces
     assert (states[-1].positions - states[-5].positions).norm(dim=-1).max() < 0.02
+
+
+def resting_ball(num_steps, **changes):
+    """The height of a ball of 30 cm that lies on the floor, under its weight, and how far its centre has crept."""
+    points, colors, normals = ball(150, seed=2)
+    now = scene(points, colors, normals, height=0.15, num_floor=100)
+    with torch.no_grad():
+        last = roll(fall(dynamics(num_probes=150, num_bodies=1, **changes)), now, now, num_steps)[-1]
+    body = last.positions[0, now.moving[0]]
+    return body[:, 2].max().item(), (body - now.positions[0, now.moving[0]]).norm(dim=-1).max().item()
+
+
+def test_a_ball_at_rest_keeps_its_height_and_place():
+    height, crept = resting_ball(30)
+
+    assert height > 0.29 and crept < 0.02
+
+
+@pytest.mark.xfail(
+    strict=True, reason="an untrained soft body is a third as flat under the weight of 20 frames a second"
+)
+def test_an_untrained_soft_ball_at_rest_is_nearly_rigid():
+    height, _ = resting_ball(15, is_soft=True)
+
+    assert height > 0.27
 
 
 def test_a_tilted_body_is_turned_by_what_it_hits():
@@ -215,17 +279,19 @@ def test_a_batch_equals_its_members_whatever_their_padding():
     assert torch.allclose(rolled(both)[1, kept[0]], rolled(shorter)[0, kept[0]], atol=1e-8)
 
 
-def test_friction_and_inertia_are_learned_from_a_body_that_strikes_and_slides():
+def test_friction_bounce_and_inertia_are_learned_from_a_body_that_strikes_and_slides():
     points, colors, normals = cube(300, seed=5)
     turn = rotation_about([0, 1, 0], 0.3)
     aside = torch.tensor([0.05, 0.0, 0.0], dtype=torch.float64)
-    model = dynamics(num_anchors=1, num_probes=300, num_matched=300)
+    model = dynamics(num_probes=300, force_scale=0.01)  # what comes faster than 3 mm a step bounces
     now = scene(points @ turn.T, colors, normals @ turn.T, height=0.25, num_floor=400)
     before = scene(points @ turn.T - aside, colors, normals @ turn.T, height=0.30, num_floor=400)
 
     roll(model, before, now, 3)[-1].positions.square().sum().backward()
 
-    assert model.log_friction.grad.abs() > 0 and model.log_inertia_ratio.grad.abs() > 0
+    friction, restitution = model.materials.network[-1].bias.grad[:2]
+    assert friction.abs() > 0 and restitution.abs() > 0
+    assert model.log_inertia_ratio.grad.abs() > 0 and model.log_rest_speed.grad.abs() > 0
 
 
 def test_every_parameter_receives_a_finite_gradient():
@@ -238,19 +304,20 @@ def test_every_parameter_receives_a_finite_gradient():
     (states[-1].positions.square().sum() + states[-1].features.square().sum()).backward()
 
     for name, parameter in model.named_parameters():
+        # A rigid body has no use for stiffness and the like; those weights get a gradient of zero.
         assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
 
 
 def test_autocast_leaves_the_geometry_alone():
     previous, current = (particles.to(torch.float32) for particles in tossed())
-    model = InertialDynamics(**SETTINGS)
+    model = dynamics().float()
     expected = model.initialize(previous, current, RandomKeys.fixed(1))
 
     with torch.autocast("cpu", dtype=torch.bfloat16):
         memory = model.initialize(previous, current, RandomKeys.fixed(1))
 
-    for name, value in vars(expected).items():
-        assert torch.equal(getattr(memory, name), value), name
+    for (name, value), (_, other) in zip(tensors_of(expected), tensors_of(memory), strict=True):
+        assert torch.equal(other, value), name
 
 
 def test_features_of_the_first_frame_reach_the_prediction_with_their_gradient():
@@ -278,7 +345,18 @@ def test_without_observed_normals_it_says_what_to_set():
         dynamics().initialize(current, replace(current, normals=None), RandomKeys.fixed(1))
 
 
-@pytest.mark.parametrize("changes", [{"num_anchors": 0}, {"anchor_radius": 0.0}, {"shadow_scales": [0.0]}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"num_bodies": 0},
+        {"num_probes": 0},
+        {"body_link": 0.0},
+        {"location_scale": -1.0},
+        {"force_scale": 0.0},
+        {"rest_share": -0.1},
+        {"shadow_scales": [0.0]},
+    ],
+)
 def test_wrong_settings_are_refused(changes):
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match=next(iter(changes)).removeprefix("shadow_")):
         dynamics(**changes)

@@ -4,36 +4,16 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.dynamics.solids import cube, rotation_about
 from vpd_lightning.dynamics.rigid_motion import (
     anchor_weights,
     equidistant_centers,
     farthest_points,
     fit_twists,
-    match_locally_rigid,
+    rigid_fit,
     rotate,
     rotation_from_spin,
 )
-
-FACES = [(0, 1), (0, -1), (1, 1), (1, -1), (2, 1)]  # the bottom face is hidden
-COLORS = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8], [0.8, 0.8, 0.1], [0.1, 0.8, 0.8]])
-
-
-def cube(count, seed, half=0.15, dtype=torch.float64):
-    """Points, colours and normals on five faces of a cube about the origin."""
-    generator = torch.Generator().manual_seed(seed)
-    face = torch.randint(0, 5, (count,), generator=generator)
-    positions = (torch.rand(count, 3, generator=generator, dtype=dtype) * 2 - 1) * half
-    normals = torch.zeros(count, 3, dtype=dtype)
-    for number, (axis, sign) in enumerate(FACES):
-        positions[face == number, axis] = sign * half
-        normals[face == number, axis] = sign
-    return positions, COLORS[face].to(dtype), normals
-
-
-def rotation_about(axis, angle):
-    axis = torch.tensor(axis, dtype=torch.float64)
-    vector = (axis / axis.norm() * angle).numpy()
-    return torch.from_numpy(Rotation.from_rotvec(vector).as_matrix())
 
 
 def test_spin_is_twice_the_tangent_of_half_the_angle():
@@ -79,67 +59,41 @@ def test_one_seen_face_leaves_the_centre_with_the_particles():
     assert torch.allclose(centers[0, 0], positions.mean(0), atol=1e-6)
 
 
-def random_toss(seed):
-    previous, previous_colors, _ = cube(400, seed=10 + seed)
-    points, colors, _ = cube(200, seed=30 + seed)
-    start = torch.from_numpy(Rotation.random(rng=seed).as_matrix())
-    generator = torch.Generator().manual_seed(seed)
-    spin = (torch.rand(3, generator=generator, dtype=torch.float64) * 2 - 1) * 0.3  # up to 6 rad/s at 20 frames/s
-    shift = (torch.rand(3, generator=generator, dtype=torch.float64) * 2 - 1) * 0.05
-    turn = torch.from_numpy(Rotation.from_rotvec(spin.numpy()).as_matrix())
-    before = points @ start.T
-    return previous @ start.T, previous_colors, before @ turn.T + shift, colors, before
+def test_a_fit_finds_the_rotation_of_weighted_points_exactly():
+    source, _, _ = cube(60, seed=7)
+    rotation, shift = rotation_about([2, -1, 1], 2.0), torch.tensor([0.4, 0.1, -0.3], dtype=torch.float64)
+    weights = torch.rand(1, 3, 60, dtype=torch.float64)
+
+    found, here, there = rigid_fit(source[None], (source @ rotation.T + shift)[None], weights)
+
+    # 1e-7 is added to a covariance of about 0.01
+    assert torch.allclose(found, rotation.expand(1, 3, 3, 3), atol=1e-4)
+    assert torch.allclose(there[0], here[0] @ rotation.T + shift, atol=1e-12)
 
 
-def test_matching_finds_the_motion_of_a_tossed_cube_within_a_centimetre():
-    # Acceptance figure of the design: rms at most 1.0 cm where nothing moving at all costs several.
-    errors, zeros = [], []
-    for seed in range(12):
-        previous, previous_colors, current, colors, before = random_toss(seed)
-        brighter = colors * (0.9 + 0.02 * seed)  # shading differs between frames
-        matched = match_locally_rigid(
-            current[None],
-            brighter[None],
-            torch.ones(1, 200, dtype=torch.bool),
-            previous[None],
-            previous_colors[None],
-            torch.ones(1, 400, dtype=torch.bool),
-            num_anchors=4,
-            radius=0.3,
-            match_scales=[0.12, 0.07, 0.04, 0.025, 0.015],
-            color_scale=0.05,
-        )
-        errors.append((matched[0] - before).square().sum(-1).mean())
-        zeros.append((current - before).square().sum(-1).mean())
+def test_a_fit_agrees_with_that_of_scipy_on_points_that_match_badly():
+    generator = torch.Generator().manual_seed(1)
+    source, goal = torch.randn(2, 25, 3, generator=generator, dtype=torch.float64)
+    weights = torch.rand(25, generator=generator, dtype=torch.float64)
 
-    assert torch.stack(errors).mean().sqrt() < 0.010
-    assert torch.stack(zeros).mean().sqrt() > 0.04
+    found, here, there = rigid_fit(source[None], goal[None], weights[None, None])
 
-
-def test_matching_a_still_body_finds_no_motion():
-    positions, colors, _ = cube(200, seed=3)
-    mask = torch.ones(1, 200, dtype=torch.bool)
-
-    matched = match_locally_rigid(
-        positions[None], colors[None], mask, positions[None], colors[None], mask,
-        num_anchors=4, radius=0.3, match_scales=[0.05, 0.015], color_scale=0.05,
-    )  # fmt: skip
-
-    assert (matched[0] - positions).norm(dim=-1).max() < 2e-3
+    a, b = source - here[0, 0], goal - there[0, 0]
+    expected, _ = Rotation.align_vectors(b.numpy(), a.numpy(), weights=weights.numpy())
+    assert torch.allclose(found[0, 0], torch.from_numpy(expected.as_matrix()), atol=1e-5)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_hardly_any_particles_give_finite_motions(count):
-    positions, colors, _ = cube(5, seed=0)
-    mask = (torch.arange(5) < count)[None]
+def test_a_fit_of_hardly_any_points_is_a_finite_rotation(count):
+    source, _, _ = cube(5, seed=0)
+    weights = (torch.arange(5) < count).double()[None, None]
 
-    matched = match_locally_rigid(
-        positions[None], colors[None], mask, positions[None] + 0.1, colors[None], mask,
-        num_anchors=3, radius=0.3, match_scales=[0.05], color_scale=0.05,
-    )  # fmt: skip
+    found, here, there = rigid_fit(source[None], source[None] + 0.1, weights)
 
-    assert torch.isfinite(matched).all()
-    assert torch.equal(matched[0, count:], positions[count:])
+    assert torch.allclose(found @ found.mT, torch.eye(3, dtype=torch.float64), atol=1e-9)
+    assert torch.linalg.det(found[0, 0]).item() == pytest.approx(1.0)
+    if count:
+        assert torch.allclose(there - here, torch.full_like(here, 0.1))
 
 
 def test_anchors_are_valid_particles_and_weights_ignore_padding():

@@ -30,6 +30,14 @@ MODELS = {
         "renderer=splat",
         "data.moving_ray_fraction=0.5",
     ],
+    "objects": [
+        "encoder=unet_objects",
+        "encoder.num_particles=48",
+        "dynamics=inertial",
+        "renderer=splat",
+        "loss=pixel_and_motion",
+        "data.load_future=true",
+    ],
 }
 
 
@@ -47,7 +55,7 @@ def build_training(data: Path, model: str) -> tuple[VPDModule, VideoDataModule]:
         torch.manual_seed(0)
         simulator = build_simulator(config)
     background = simulator.encoder.background
-    if background is not None:
+    if background is not None and background.needs_fit:
         background.fit(*datamodule.median_background())  # type: ignore[operator]
     module = VPDModule(
         simulator=simulator,
@@ -82,8 +90,8 @@ def test_all_weights_learn_and_an_interrupted_training_equals_an_uninterrupted_o
     check = CheckGradients()
     tiny_trainer(tmp_path / "a", 4, [check], val_check_interval=2).fit(module, datamodule)
     missed = {name for name, parameter in module.named_parameters() if parameter.requires_grad} - check.reached
-    # Nothing slides over anything in these recordings; tests/dynamics/test_inertial.py reaches friction.
-    assert missed <= {"simulator.dynamics.log_friction"}
+    # Nothing strikes anything in these recordings; tests/dynamics/test_inertial.py reaches the speed of a bounce.
+    assert missed <= {"simulator.dynamics.log_rest_speed"}
 
     module, datamodule = build_training(data, model)
     with pytest.raises(SystemExit):
@@ -103,5 +111,5 @@ def test_bf16_trains(data: Path, tmp_path: Path, model: str) -> None:
     module, datamodule = build_training(data, model)
     trainer = tiny_trainer(tmp_path, 2, precision="bf16-mixed", val_check_interval=2)
     trainer.fit(module, datamodule)
-    assert float(module.train_metrics["loss"]) > 0
+    assert torch.isfinite(torch.as_tensor(module.train_metrics["loss"]))  # evidence of motion may be above one
     assert all(parameter.isfinite().all() for parameter in module.parameters())

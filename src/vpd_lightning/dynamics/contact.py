@@ -241,11 +241,17 @@ class ContactSolver:
         usable = contacts.known[:, None, None] & from_first & to_second  # batch body body probe
         deepest, probe = gaps[:, None, None].expand(usable.shape).masked_fill(~usable, torch.inf).min(dim=-1)
         depth, probe = torch.relu(-deepest).flatten(1)[..., None], probe.flatten(1)
+        first, second = (
+            index.expand(len(own), -1) for index in (bodies.repeat_interleave(count), bodies.repeat(count))
+        )
+        # Both bodies are pushed at one place, between the two points: at two, they would be turned out of nothing.
+        place = (vectors_of(there, probe) + vectors_of(there, torch.gather(contacts.other, 1, probe))) / 2
+        centers = motion.centers + motion.displacements
         pairs = _Pairs(
-            first=bodies.repeat_interleave(count).expand(len(own), -1),
-            second=bodies.repeat(count).expand(len(own), -1),
-            first_arms=vectors_of(turned, probe),
-            second_arms=vectors_of(turned, torch.gather(contacts.other, 1, probe)),
+            first=first,
+            second=second,
+            first_arms=place - vectors_of(centers, first),
+            second_arms=place - vectors_of(centers, second),
             normals=vectors_of(facing, probe),
             approach=torch.zeros_like(depth),
             is_active=depth > 0,

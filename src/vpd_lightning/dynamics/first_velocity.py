@@ -11,6 +11,7 @@ from vpd_lightning.dynamics.rigid_motion import cross, rigid_fit, rotate, rotati
 
 _EVIDENCE = 0.3  # a match this strong (a perfect one counts 1) is believed by half
 _NUM_SPACED = 128  # points of which the spacing is measured
+_TOO_FAR = 0.01  # where matches within a scale are believed by less than this, the body stays where it is
 _NO_MATCH = 0.1  # a body whose matches are believed by less than this was not seen before: no velocity
 
 
@@ -133,11 +134,14 @@ class FirstVelocity(nn.Module):
         """Return the poses that soft matches of shrinking scale agree on, and the last scale (metres) of each point."""
         radius = (members * radii[..., None]).sum(dim=1)  # of each particle's body
         poses = _unmoved(some.positions, members)
+        count = members.sum(dim=2).clamp(min=1)
         for scale in self.match_scales:
             scales = torch.maximum(scale * radius, smallest).clamp(min=1e-9)
             matched, evidence, _ = match(poses.of(some.positions, members), target, cost, scales)
-            weights = members * (believed(evidence) + 1e-6)[:, None]
-            poses = Poses(*rigid_fit(some.positions, matched, weights))
+            weights = members * believed(evidence)[:, None]
+            # Soft matches always lie somewhere: a body that was not seen before must not jump onto another.
+            is_near = weights.sum(dim=2) / count > _TOO_FAR
+            poses = _where(is_near, Poses(*rigid_fit(some.positions, matched, weights + 1e-6 * members)), poses)
         return poses, scales
 
     def appearance_cost(self, some: Surfels, target: Surfels) -> Float[Tensor, "batch particle target"]:
@@ -247,6 +251,16 @@ def _unmoved(positions: Tensor, members: Tensor) -> Poses:
     centers = weighted_sum(weights, positions)
     eye = torch.eye(3, dtype=positions.dtype, device=positions.device)
     return Poses(eye.expand(*centers.shape, 3), centers, centers)
+
+
+def _where(chosen: Bool[Tensor, "batch body"], one: Poses, other: Poses) -> Poses:
+    """Return for each body the chosen one of two poses."""
+    chosen = chosen[..., None]
+    return Poses(
+        torch.where(chosen[..., None], one.rotations, other.rotations),
+        torch.where(chosen, one.centers, other.centers),
+        torch.where(chosen, one.goals, other.goals),
+    )
 
 
 def _spin(rotations: Float[Tensor, "batch body 3 3"]) -> Float[Tensor, "batch body 3"]:

@@ -9,7 +9,14 @@ from scipy.spatial import cKDTree
 _NUM_TANGENT_PLANES = 4
 """Nearest points of a wide surface whose tangent planes a doubtful point is held against."""
 
+<<<<<<< HEAD
 _MAX_SURFACE_POINTS = 2000
+=======
+_MIN_STRAIGHTNESS = 0.7071067811865476
+"""Cosine of 45 degrees: where a row or column of pixels bends by more between its steps, two surfaces meet."""
+
+_MAX_SURFACE_POINTS = 6000
+>>>>>>> tests_work
 """A wide surface is flat where it is held against; this many of its points are enough and keep the search cheap."""
 
 
@@ -27,10 +34,13 @@ def wide_surfaces(
     """Return which valid pixels lie on a surface that is smooth and wide.
 
     Neighbouring pixels are of one surface where the step between their points leaves both tangent planes by no more
-    than ``max_slope`` of its length and their normals differ by no more than ``max_turn`` (a cosine). A surface is wide
-    where the diagonal of its bounding box is at least ``min_width`` of that of all valid points. What is left over
-    belongs to it, too, if its point lies within ``tolerance`` footprints (metres that a pixel covers) of the tangent
-    plane of a near point of it, from whatever view: image borders, and the seam at the foot of a body.
+    than ``max_slope`` of its length and their normals differ by no more than ``max_turn`` (a cosine). Where a row
+    or column of pixels bends sharply, a pixel is linked with none: normals along a seam lie between those of its two
+    sides, and where the seam crosses rows of pixels at a small angle they change so slowly that one side leads to the
+    other. A surface is wide where the diagonal of its bounding box is at least ``min_width`` of that of all valid
+    points. What is left over belongs to it, too, if its point lies within ``tolerance`` footprints (metres that a pixel
+    covers) of the tangent plane of a near point of it, from whatever view: image borders, and the seam at the foot of a
+    body.
 
     One time step is enough, cameras may move, and nothing is said of directions: a wall is as good as a floor.
     """
@@ -42,11 +52,20 @@ def wide_surfaces(
     usable = flat_valid[senders] & flat_valid[receivers]
     senders, receivers = senders[usable], receivers[usable]
     steps = flat[receivers] - flat[senders]
+<<<<<<< HEAD
     limit = max_slope * np.sqrt(_dot(steps, steps))
     ends = flat_normals[senders], flat_normals[receivers]
     smooth = _dot(*ends) > max_turn
     for normal in ends:
         smooth &= np.abs(_dot(normal, steps)) < limit
+=======
+    lengths = np.sqrt((steps**2).sum(axis=-1))
+    smooth = (flat_normals[senders] * flat_normals[receivers]).sum(axis=-1) > max_turn
+    for end in (senders, receivers):
+        smooth &= np.abs((flat_normals[end] * steps).sum(axis=-1)) < max_slope * lengths
+    bent = _bent(points, valid).ravel()
+    smooth &= ~(bent[senders] | bent[receivers])
+>>>>>>> tests_work
     links = coo_array((np.ones(smooth.sum(), bool), (senders[smooth], receivers[smooth])), shape=(valid.size,) * 2)
     _, labels = connected_components(links, directed=False)
     wide = _is_wide(flat, flat_valid, labels, min_width)
@@ -56,8 +75,21 @@ def wide_surfaces(
     return wide.reshape(shape)
 
 
+<<<<<<< HEAD
 def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.einsum("...i,...i", first, second)  # several times faster than a product and a sum of three
+=======
+def _bent(points: np.ndarray, valid: np.ndarray) -> Bool[np.ndarray, "view height width"]:
+    """Mark the pixels between whose neighbours a row or column of pixels changes its direction too much."""
+    bent = np.zeros_like(valid)
+    for axis in (1, 2):
+        along, there, found = (np.moveaxis(values, axis, 1) for values in (points, valid, bent))
+        steps = along[:, 1:] - along[:, :-1]
+        lengths = np.sqrt((steps**2).sum(axis=-1))
+        cosine = (steps[:, 1:] * steps[:, :-1]).sum(axis=-1)
+        found[:, 1:-1] |= (cosine < _MIN_STRAIGHTNESS * lengths[:, 1:] * lengths[:, :-1]) & there[:, 2:] & there[:, :-2]
+    return bent
+>>>>>>> tests_work
 
 
 def _is_wide(points: np.ndarray, valid: np.ndarray, labels: np.ndarray, min_width: float) -> Bool[np.ndarray, " point"]:

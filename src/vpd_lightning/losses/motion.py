@@ -66,11 +66,11 @@ class MotionLoss(AbstractLoss):
 
 
 def _cost(evidence: Tensor, valid: Tensor, others: Tensor) -> Tensor:
-    """Return the mean negative log-evidence of the valid rows among the valid columns."""
+    """Return the mean negative log-evidence of the valid rows among the valid columns: of each member, then of all."""
     there = others.to(evidence.dtype)
     cost = -torch.log((evidence * there[..., None, :]).sum(dim=-1) + _OUTLIER)
     share = valid.to(evidence.dtype)
-    return (cost * share).sum() / share.sum().clamp(min=1)
+    return ((cost * share).sum(dim=(1, 2)) / share.sum(dim=(1, 2)).clamp(min=1)).mean()
 
 
 def _first_of(chosen: Tensor, count: int) -> tuple[Tensor, Tensor]:
