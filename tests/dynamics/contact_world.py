@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from vpd_lightning.dynamics.body_motion import BodyMotion, body_inertia
+from vpd_lightning.dynamics.body_motion import BodyMotion, body_inertia, vectors_of
 from vpd_lightning.dynamics.contact import (
     ContactPoints,
     Contacts,
@@ -102,19 +102,20 @@ class World:
             between = nearest_body_contacts(points, reach, torch.full_like(self.positions[..., 0], 0.1))
         solver = ContactSolver(
             points=points,
+            centers=self.motion.centers,
             inertia=self.inertia(),
             materials=self.materials,
             masses=self.mass,
-            rest_speed=self.positions.new_tensor(self.rest_speed),
+            rest_speed=self.rest_speed,
         )
         return solver.resolve(free, static, between, num_iterations=self.num_iterations, max_depth=0.1)
 
     def step(self) -> None:
         self.last = self.resolve()
         step, onward = self.last.step, self.last.onward
-        moved = step.centers[:, :, None] + step.displacements[:, :, None]
-        moved = moved + step.turned(self.positions[:, None] - step.centers[:, :, None])
-        self.positions = (self.members[..., None] * moved).sum(dim=1)
+        own = self.members.argmax(dim=1)
+        offsets = self.positions - vectors_of(step.centers, own)
+        self.positions = vectors_of(step.centers + step.displacements, own) + step.turned(offsets, own)
         turned = rotate(rotation_from_spin(step.spins)[:, :, None], self.normals[:, None])
         self.normals = (self.members[..., None] * turned).sum(dim=1)
         stretches, _ = step.following_stretches()

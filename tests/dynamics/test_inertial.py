@@ -24,6 +24,7 @@ SETTINGS = {
     "num_forces": 2,
     "location_scale": 0.3,
     "force_scale": 0.1,
+    "residual_share": 0.1,
     "contact_range": 0.5,
     "contact_reach": 5.0,
     "num_contact_iterations": 4,
@@ -53,7 +54,7 @@ def dynamics(**changes):
 def fall(model):
     """Let the model's forces be weight alone."""
     with torch.no_grad():
-        model.forces.weight.bias[2] = -math.atanh(GRAVITY / SETTINGS["force_scale"])
+        model.forces.acceleration[2] = -math.atanh(GRAVITY / SETTINGS["force_scale"])
     return model
 
 
@@ -291,7 +292,7 @@ def test_friction_bounce_and_inertia_are_learned_from_a_body_that_strikes_and_sl
 
     friction, restitution = model.materials.network[-1].bias.grad[:2]
     assert friction.abs() > 0 and restitution.abs() > 0
-    assert model.log_inertia_ratio.grad.abs() > 0 and model.log_rest_speed.grad.abs() > 0
+    assert model.log_inertia_ratio.grad.abs() > 0
 
 
 def test_every_parameter_receives_a_finite_gradient():

@@ -104,6 +104,7 @@ def simulator(has_background=True):
     return Simulator(
         encoder=encoder(has_background), dynamics=PersistenceDynamics(), renderer=renderer, location_noise=0.0,
         checkpoint_dynamics=False,
+        pixel_gradient_to_motion=1.0,
     ).double()  # fmt: skip
 
 

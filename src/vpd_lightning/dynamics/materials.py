@@ -7,6 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+_GAIN = 4.0
+"""Softness spans orders of magnitude and begins at its small end; a rate that suits the others would be too slow."""
+
 
 @dataclass(frozen=True)
 class Materials:
@@ -41,8 +44,8 @@ class MaterialNetwork(nn.Module):
         assert isinstance(last, nn.Linear)
         nn.init.zeros_(last.weight)
         with torch.no_grad():
-            # friction 0.5, restitution 0.1, density 1, softness 0.1, stiffness 0.25, damping 0.1
-            start = [math.log(0.5), _logit(0.1), 0.0, _logit(0.1), _logit(0.25), _logit(0.1)]
+            # friction 0.5, restitution 0.1, density 1, softness 0.01, stiffness 0.25, damping 0.1
+            start = [math.log(0.5), _logit(0.1), 0.0, _logit(0.01) / _GAIN, _logit(0.25), _logit(0.1)]
             last.bias.copy_(torch.tensor(start))
 
     def forward(
@@ -51,7 +54,7 @@ class MaterialNetwork(nn.Module):
         """Return the materials; ``weights`` sum to one over the particles of a body."""
         mean = torch.einsum("bkp,bpf->bkf", weights, features)
         friction, restitution, density, softness, stiffness, damping = self.network(mean).split(1, dim=-1)
-        softness = torch.sigmoid(softness) if self.is_soft else torch.zeros_like(softness)
+        softness = torch.sigmoid(_GAIN * softness) if self.is_soft else torch.zeros_like(softness)
         return Materials(
             friction=torch.exp(friction.clamp(-5, 2)),
             restitution=torch.sigmoid(restitution),

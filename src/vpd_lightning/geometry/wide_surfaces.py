@@ -9,14 +9,10 @@ from scipy.spatial import cKDTree
 _NUM_TANGENT_PLANES = 4
 """Nearest points of a wide surface whose tangent planes a doubtful point is held against."""
 
-<<<<<<< HEAD
-_MAX_SURFACE_POINTS = 2000
-=======
 _MIN_STRAIGHTNESS = 0.7071067811865476
 """Cosine of 45 degrees: where a row or column of pixels bends by more between its steps, two surfaces meet."""
 
-_MAX_SURFACE_POINTS = 6000
->>>>>>> tests_work
+_MAX_SURFACE_POINTS = 2000
 """A wide surface is flat where it is held against; this many of its points are enough and keep the search cheap."""
 
 
@@ -52,20 +48,13 @@ def wide_surfaces(
     usable = flat_valid[senders] & flat_valid[receivers]
     senders, receivers = senders[usable], receivers[usable]
     steps = flat[receivers] - flat[senders]
-<<<<<<< HEAD
     limit = max_slope * np.sqrt(_dot(steps, steps))
     ends = flat_normals[senders], flat_normals[receivers]
     smooth = _dot(*ends) > max_turn
     for normal in ends:
         smooth &= np.abs(_dot(normal, steps)) < limit
-=======
-    lengths = np.sqrt((steps**2).sum(axis=-1))
-    smooth = (flat_normals[senders] * flat_normals[receivers]).sum(axis=-1) > max_turn
-    for end in (senders, receivers):
-        smooth &= np.abs((flat_normals[end] * steps).sum(axis=-1)) < max_slope * lengths
     bent = _bent(points, valid).ravel()
     smooth &= ~(bent[senders] | bent[receivers])
->>>>>>> tests_work
     links = coo_array((np.ones(smooth.sum(), bool), (senders[smooth], receivers[smooth])), shape=(valid.size,) * 2)
     _, labels = connected_components(links, directed=False)
     wide = _is_wide(flat, flat_valid, labels, min_width)
@@ -75,21 +64,20 @@ def wide_surfaces(
     return wide.reshape(shape)
 
 
-<<<<<<< HEAD
 def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.einsum("...i,...i", first, second)  # several times faster than a product and a sum of three
-=======
+
+
 def _bent(points: np.ndarray, valid: np.ndarray) -> Bool[np.ndarray, "view height width"]:
     """Mark the pixels between whose neighbours a row or column of pixels changes its direction too much."""
     bent = np.zeros_like(valid)
     for axis in (1, 2):
         along, there, found = (np.moveaxis(values, axis, 1) for values in (points, valid, bent))
         steps = along[:, 1:] - along[:, :-1]
-        lengths = np.sqrt((steps**2).sum(axis=-1))
-        cosine = (steps[:, 1:] * steps[:, :-1]).sum(axis=-1)
+        lengths = np.sqrt(_dot(steps, steps))
+        cosine = _dot(steps[:, 1:], steps[:, :-1])
         found[:, 1:-1] |= (cosine < _MIN_STRAIGHTNESS * lengths[:, 1:] * lengths[:, :-1]) & there[:, 2:] & there[:, :-2]
     return bent
->>>>>>> tests_work
 
 
 def _is_wide(points: np.ndarray, valid: np.ndarray, labels: np.ndarray, min_width: float) -> Bool[np.ndarray, " point"]:

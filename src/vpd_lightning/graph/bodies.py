@@ -14,6 +14,9 @@ _SPACING_RANK = 4
 _SPARSEST = 2.5
 """How many times the usual spacing particles may lie apart where cameras see a surface from the side."""
 
+_JOIN_SHARE = 0.8
+"""Islands between which at least this share of the pairs is not hollow are parts of one body."""
+
 _PART_SHARE = 0.08
 """An island of at most this share of another one may be a sparsely seen part of it."""
 
@@ -38,7 +41,7 @@ def label_bodies(
     hollow: (n_i - n_j) . (x_i - x_j) / |x_i - x_j| is at least ``-max_concavity`` (after the convexity criterion of
     Stein et al. 2014, "Object partitioning using local convexity"). Bodies that touch meet in a hollow. A particle with
     more than ``max_concave_share`` of hollow pairs links with none: in a touch there may be a single pair that is not.
-    Islands between which most pairs are not hollow are joined again.
+    Islands between which nearly all pairs are not hollow are joined again.
     What is in no island of some size, and islands beyond ``num_bodies``, joins the nearest body. Scene by scene, on
     the CPU; the numbers do not depend on the order of the particles, on the place of the world or its scale.
     """
@@ -62,7 +65,7 @@ def _islands(senders: np.ndarray, receivers: np.ndarray, count: int) -> np.ndarr
 def _joined(
     islands: np.ndarray, senders: np.ndarray, receivers: np.ndarray, smooth: np.ndarray, max_share: float
 ) -> np.ndarray:
-    """Join islands between which most pairs of particles are not hollow: parts of one body.
+    """Join islands between which nearly all pairs of particles are not hollow: parts of one body.
 
     One of the two must have at most ``max_share`` of the particles of the other.
     """
@@ -72,8 +75,11 @@ def _joined(
     high = np.maximum(islands[senders[across]], islands[receivers[across]])
     pairs, which = np.unique(low * count + high, return_inverse=True)
     low, high = np.divmod(pairs, count)
-    share = np.bincount(which, smooth[across], minlength=len(pairs)) / np.bincount(which, minlength=len(pairs)).clip(1)
-    join = (share > 0.5) & (np.minimum(sizes[low], sizes[high]) <= max_share * np.maximum(sizes[low], sizes[high]))
+    number = np.bincount(which, minlength=len(pairs))
+    share = np.bincount(which, smooth[across], minlength=len(pairs)) / number.clip(1)
+    join = (share > _JOIN_SHARE) & (
+        np.minimum(sizes[low], sizes[high]) <= max_share * np.maximum(sizes[low], sizes[high])
+    )
     return _islands(low[join], high[join], count)[islands]
 
 
