@@ -219,9 +219,6 @@ def test_a_ball_at_rest_keeps_its_height_and_place():
     assert height > 0.29 and crept < 0.02
 
 
-@pytest.mark.xfail(
-    strict=True, reason="an untrained soft body is a third as flat under the weight of 20 frames a second"
-)
 def test_an_untrained_soft_ball_at_rest_is_nearly_rigid():
     height, _ = resting_ball(15, is_soft=True)
 

@@ -67,7 +67,7 @@ def _joined(
 ) -> np.ndarray:
     """Join islands between which nearly all pairs of particles are not hollow: parts of one body.
 
-    One of the two must have at most ``max_share`` of the particles of the other.
+    One of the two must have at most ``max_share`` of the particles of the other. Stray particles would be bridges.
     """
     count, sizes = int(islands.max()) + 1, np.bincount(islands)
     across = islands[senders] != islands[receivers]
@@ -77,9 +77,8 @@ def _joined(
     low, high = np.divmod(pairs, count)
     number = np.bincount(which, minlength=len(pairs))
     share = np.bincount(which, smooth[across], minlength=len(pairs)) / number.clip(1)
-    join = (share > _JOIN_SHARE) & (
-        np.minimum(sizes[low], sizes[high]) <= max_share * np.maximum(sizes[low], sizes[high])
-    )
+    smaller, larger = np.minimum(sizes[low], sizes[high]), np.maximum(sizes[low], sizes[high])
+    join = (share > _JOIN_SHARE) & (smaller <= max_share * larger) & (smaller >= _MIN_PARTICLES)
     return _islands(low[join], high[join], count)[islands]
 
 
