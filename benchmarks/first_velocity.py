@@ -87,9 +87,10 @@ def judge(simulator: Simulator, clip: Clip, views: Sequence[int], margin: float)
     own, motion = memory.own[0][memory.mask[0]], memory.motion
     velocity = torch.zeros_like(positions)
     back = rotation_from_spin(-motion.spins)[0, own]
-    offsets = positions[index] - motion.centers[0, own]
+    local = positions[index] - memory.origin[0]
+    offsets = local - motion.centers[0, own]
     before = (motion.centers - motion.displacements)[0, own] + rotate(back, offsets)
-    velocity[index] = positions[index] - before
+    velocity[index] = local - before
     said = torch.zeros(len(positions), dtype=torch.bool).index_fill_(0, index, True)
     stray, judged = said.clone(), []
     centers = clip.poses(1)[0, :, :3], clip.previous_pose()[:, :3]

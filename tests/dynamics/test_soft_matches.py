@@ -17,7 +17,7 @@ def test_the_best_match_of_a_point_is_the_nearest_of_its_colour():
     scales = 0.1 + torch.rand(1, 7, generator=generator, dtype=torch.float64)
     target = replace(target, mask=torch.arange(11)[None] != 4)
 
-    matched, evidence, best = match(at, target, cost, scales)
+    matched, evidence, shares = match(at, target, cost, scales)
 
     for point in range(7):
         weights = {}
@@ -26,7 +26,7 @@ def test_the_best_match_of_a_point_is_the_nearest_of_its_colour():
             weights[other] = float(torch.exp(-square / (2 * scales[0, point] ** 2) - cost[0, point, other]))
         total = sum(weights.values())
         mean = sum(weight * target.positions[0, other] for other, weight in weights.items()) / total
-        assert best[0, point].item() == max(weights, key=weights.get)
+        assert shares[0, point].argmax().item() == max(weights, key=weights.get)
         assert torch.allclose(matched[0, point], mean, atol=1e-12)
         assert evidence[0, point].item() == pytest.approx(total, rel=1e-12)
 

@@ -39,8 +39,8 @@ SMALL = {
 }
 LENGTHS = (  # options in metres, which grow with the world
     "kernel_radii", "kernel_bandwidths", "near", "far", "footprint", "surface_scale", "r_s", "r_a_s",
-    "location_scale", "anchor_radius", "body_radius", "contact_range", "contact_reach", "max_contact_depth",
-    "match_scales", "match_radius", "shadow_scales", "workspace_min", "workspace_max", "max_radius",
+    "location_scale", "force_scale", "contact_range", "contact_reach", "max_contact_depth", "shadow_scales",
+    "workspace_min", "workspace_max", "max_radius",
 )  # fmt: skip
 
 

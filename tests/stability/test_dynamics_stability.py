@@ -72,7 +72,10 @@ def test_states_and_gradients_are_finite(
 
 
 @pytest.mark.parametrize("name", ["ordinary", "one_particle", "k_plus_1_particles", "on_a_line"])
-def test_float32_steps_are_those_of_float64(option: str, name: str, device: torch.device):
+def test_float32_steps_are_those_of_float64(
+    option: str, name: str, device: torch.device, request: pytest.FixtureRequest
+):
+    known_fault(request, "equally_near", (option, name) == ("inertial", "on_a_line"))
     single, points = Mode("float32", torch.float32), SCENES[name]().points.float().double()
     first, second = (stage("dynamics", option, mode, device).eval() for mode in (single, FLOAT64))
     second.load_state_dict(first.state_dict())
@@ -82,10 +85,8 @@ def test_float32_steps_are_those_of_float64(option: str, name: str, device: torc
     ours, exact = rolled(first, pair, single, device)[-1], rolled(second, twin, FLOAT64, device)[-1]
 
     # Networks of gain about one: a hundred eps of the metre that the scene is wide.
-    # Only a ridge of 1e-6 says how a line turns about itself: the inertial dynamics is 50 times less sure there.
-    doubt = 50 if (option, name) == ("inertial", "on_a_line") else 1
-    torch.testing.assert_close(ours.positions.double(), exact.positions, rtol=0, atol=doubt * 1e-4)
-    torch.testing.assert_close(ours.features.double(), exact.features, rtol=0, atol=doubt * 1e-3)
+    torch.testing.assert_close(ours.positions.double(), exact.positions, rtol=0, atol=1e-4)
+    torch.testing.assert_close(ours.features.double(), exact.features, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("shift", [10.0, 1e3])

@@ -40,7 +40,7 @@ def require_measured_places(option: str) -> None:
 
 def fitted(option: str, mode: Mode, device: torch.device, **changes) -> AbstractEncoder:
     encoder = stage("encoder", option, mode, device, **changes)
-    if getattr(encoder, "background", None) is not None:
+    if getattr(encoder, "background", None) is not None and encoder.background.needs_fit:
         empty = ball_frames(batch_size=1, has_ball=False).to(device, mode.dtype)
         encoder.background.fit(empty.rgb[0], empty.depth[0], empty.cameras[0])
     return encoder

@@ -301,14 +301,20 @@ def _nearest(
 ) -> tuple[Int[Tensor, "batch query"], Bool[Tensor, "batch query"]]:
     """Return the nearest usable point of each query and whether there is one.
 
-    Only the order matters here, so the product form of the squared distance will do, in half the time: it may take one
-    of two points for the nearer that are equally far within a few millimetres in a world of ten metres.
+    The product form of the squared distance, in half the time of differences, finds the two nearest, and differences
+    decide between them: two points may be equally far, and rounding must not choose.
     """
     origin = queries.mean(dim=1, keepdim=True)
     local, others = queries - origin, points - origin
     order = torch.baddbmm(others.square().sum(dim=-1)[:, None], local, others.mT, alpha=-2)
-    lowest, index = order.masked_fill(~usable, torch.inf).min(dim=-1)
-    return index, torch.isfinite(lowest)
+    lowest, index = order.masked_fill(~usable, torch.inf).topk(min(2, order.shape[-1]), dim=-1, largest=False)
+    index = index.sort(dim=-1).values  # of equally far ones the first
+    gaps = queries[:, :, None] - vectors_of(points, index.flatten(1)).unflatten(1, index.shape[1:])
+    square = gaps.square().sum(dim=-1)
+    exists = torch.isfinite(lowest[..., :1])
+    chosen = torch.gather(usable.expand(order.shape), 2, index)
+    which = square.masked_fill(~chosen, torch.inf).argmin(dim=-1, keepdim=True)
+    return torch.gather(index, 2, which).squeeze(-1), exists.squeeze(-1)
 
 
 def _as_push(motion: BodyMotion) -> Push:

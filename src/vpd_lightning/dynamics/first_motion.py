@@ -1,6 +1,6 @@
 """The bodies of the first frame and how each came there: what may move, gathered, divided and matched."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -57,8 +57,11 @@ def find_first_motion(
     """Divide what may move now into bodies (``label_bodies``) and find where each was, in frames from ``observed``."""
     index, mask = gather_index(movable(current))
     seen = _surfels(current, index, mask)
+    # Far from the origin of the world coordinates have few digits left; differences of near ones are exact.
+    origin = seen.positions[:, :1]
+    near = replace(seen, positions=seen.positions - origin)
     labels = label_bodies(
-        seen.positions,
+        near.positions,
         seen.normals,
         mask,
         num_bodies=num_bodies,
@@ -72,7 +75,8 @@ def find_first_motion(
     if first_velocity is None:
         matched = MatchedMotion(torch.zeros_like(seen.positions), torch.zeros_like(seen.positions[..., 0]))
     else:
-        matched = first_velocity(seen, bodies, _surfels(previous, *gather_index(movable(previous))))
+        before = _surfels(previous, *gather_index(movable(previous)))
+        matched = first_velocity(near, bodies, replace(before, positions=before.positions - origin))
     return FirstMotion(index, mask, seen, bodies, labels.clamp(min=0), matched)
 
 

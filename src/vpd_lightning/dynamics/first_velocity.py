@@ -61,7 +61,7 @@ class FirstVelocity(nn.Module):
     body replaces the matches, and the scale shrinks along ``match_scales`` (in radii of the body), but not below
     ``min_scale`` spacings of the points. Single matches fail on surfaces of one colour (the aperture problem);
     agreement on one motion resolves them. Then ``num_plane_rounds`` Gauss-Newton steps bring each point onto the
-    tangent plane of its best match (Chen and Medioni 1992), while its soft match pulls along the surface with
+    tangent planes of its match (Chen and Medioni 1992), while its soft match pulls along the surface with
     ``tangential_weight``: points of two frames are never the same points, and between them a surface is known better
     than any point. How much it pulls depends on how many colours the body has: on one colour, one place is as good as
     another; there a turn that planes do not tell, such as the spin of a plain ball, is taken for rest
@@ -174,10 +174,13 @@ class FirstVelocity(nn.Module):
     ) -> tuple[Poses, Float[Tensor, "batch particle"]]:
         """Take one Gauss-Newton step of every body onto the surface seen before; also return belief in the matches."""
         at = poses.of(some.positions, members)
-        matched, evidence, best = match(at, target, cost, scales)
+        matched, evidence, weights = match(at, target, cost, scales)
         belief = believed(evidence)
-        normals, goals = (_take(values, best) for values in (target.normals, target.positions))
-        off_plane = ((goals - at) * normals).sum(dim=-1)
+        # Mean planes, not that of the best match: two points may be equally good, and rounding would choose.
+        normals = weights @ target.normals
+        middle = _masked_mean(target.positions, target.mask)
+        heights = weights @ ((target.positions - middle) * target.normals).sum(dim=-1, keepdim=True)
+        off_plane = heights.squeeze(-1) - ((at - middle) * normals).sum(dim=-1)
         # A point whose plane is far off has no match there, whatever the soft one says (Geman-McClure weights).
         trust = 1 / (1 + (off_plane.detach() / smallest.clamp(min=1e-9)).square())
         plane_weights = belief * trust * (normals.square().sum(dim=-1) > 0.5)
@@ -216,7 +219,7 @@ def chromaticity(colors: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 6"]
 def match(
     at: Tensor, target: Surfels, cost: Tensor, scales: Float[Tensor, "batch particle"]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return soft matches (metres), their evidence (1 for one perfect match) and the index of the best one."""
+    """Return soft matches (metres), their evidence (1 for one perfect match) and the weights of the points."""
     origin = _masked_mean(target.positions, target.mask)
     local, goals = at - origin, target.positions - origin
     # The product form of the squared distance, two to three times faster than differences: about the middle of the
@@ -226,10 +229,11 @@ def match(
     logits = -square / (2 * scales[..., None].square()) - cost
     # What is not there counts for nothing, and even where nothing is there the numbers stay finite.
     logits = logits.masked_fill(~target.mask[:, None], -1e4).clamp(min=-1e4)
-    top, best = logits.detach().max(dim=-1, keepdim=True)
+    top = logits.detach().amax(dim=-1, keepdim=True)
     kernel = torch.exp(logits - top)
     total = kernel.sum(dim=-1, keepdim=True)
-    return origin + (kernel @ goals) / total, (total * torch.exp(top)).squeeze(-1), best.squeeze(-1)
+    weights = kernel / total
+    return origin + weights @ goals, (total * torch.exp(top)).squeeze(-1), weights
 
 
 def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -240,10 +244,6 @@ def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 def believed(evidence: Tensor) -> Tensor:
     """Return how far a match is believed, from its evidence: 0 to nearly 1."""
     return evidence / (evidence + _EVIDENCE)
-
-
-def _take(values: Tensor, index: Tensor) -> Tensor:
-    return torch.gather(values, 1, index[..., None].expand(-1, -1, values.shape[-1]))
 
 
 def _unmoved(positions: Tensor, members: Tensor) -> Poses:

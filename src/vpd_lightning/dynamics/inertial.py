@@ -39,6 +39,7 @@ _BOUNCE_SHARE = 0.3
 class InertialMemory:
     """What the inertial dynamics carries from step to step; gathered over the particles that may move."""
 
+    origin: Float[Tensor, "batch 1 3"]  # where all else is measured from (world coordinates)
     index: Int[Tensor, "batch moving"]  # slots of the moving candidates among all particles
     mask: Bool[Tensor, "batch moving"]
     bodies: Float[Tensor, "batch body moving"]  # 1 where a particle belongs to a body, else 0
@@ -138,6 +139,11 @@ class InertialDynamics(AbstractDynamics):
             return self._first_memory(previous, current)
 
     def _first_memory(self, previous: Particles, current: Particles) -> InertialMemory:
+        # Far from the world's origin coordinates have few digits left, so everything is seen from a particle's place:
+        # differences of near ones are exact.
+        index, _ = gather_index(movable(current))
+        origin = take(current.positions, index[:, :1]).detach()
+        previous, current = (replace(frame, positions=frame.positions - origin) for frame in (previous, current))
         found = find_first_motion(
             previous,
             current,
@@ -158,6 +164,7 @@ class InertialDynamics(AbstractDynamics):
             spacing = point_spacing(seen.positions, mask)
         materials = self.materials(seen.features, shares)
         return InertialMemory(
+            origin=origin,
             index=index,
             mask=mask,
             bodies=bodies,
@@ -202,8 +209,8 @@ class InertialDynamics(AbstractDynamics):
             return self._step(current, memory)
 
     def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
-        positions = take(current.positions, memory.index)
-        static_positions = take(current.positions, memory.static_index)
+        positions = take(current.positions, memory.index) - memory.origin
+        static_positions = take(current.positions, memory.static_index) - memory.origin
         resolved = self._resolved(positions, static_positions, current.normals, memory)  # type: ignore[arg-type]
         step, onward = self._rested(resolved)
         own = memory.own
@@ -211,7 +218,7 @@ class InertialDynamics(AbstractDynamics):
         moved = moved + step.turned(positions - vectors_of(step.centers, own), own)
         following = torch.where(memory.mask[..., None], moved, positions)
         turned = rotate(matrices_of(rotation_from_spin(step.spins), own), memory.normals)
-        all_positions = put(current.positions, memory.index, following, memory.mask)
+        all_positions = put(current.positions, memory.index, following + memory.origin, memory.mask)
         features = self._shade(current, memory, static_positions, following, turned)
         stretches, _ = step.following_stretches()
         _, strains = onward.following_stretches()
