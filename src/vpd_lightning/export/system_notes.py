@@ -7,7 +7,8 @@ SYSTEM_NOTES = {
     ),
     "inertial": (
         "Visual Particle Dynamics with dynamics that measure the first velocity by matching the two frames, carry it, "
-        "and learn corrections that move bodies rigidly. The paper has no such dynamics."
+        "keep bodies out of each other and of what stands still, and learn forces and what bodies are made of. The "
+        "paper has no such dynamics."
     ),
     "global": (
         "One latent vector for the whole scene, after NeRF-dy (Li et al., 2021) as the VPD paper compares with it: the "
