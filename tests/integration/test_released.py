@@ -95,7 +95,7 @@ def known_cameras(model: LoadedModel, size: int) -> tuple[Cameras, float]:
     distance = encoder.get("initial_depth") or (scene["near"] + scene["far"]) / 2
     placed = cameras(len(model.input_views), size=size, center=center, distance=distance)
     background = getattr(getattr(model.simulator, "encoder", None), "background", None)
-    if background is None:
+    if background is None or not background.needs_fit:
         return placed, distance
     poses = background.cam_to_world[model.input_views]
     away = (poses[:, :3, 3] - torch.tensor(center)).norm(dim=-1).min()
