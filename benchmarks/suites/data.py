@@ -142,7 +142,9 @@ def _train(
     datamodule = build(config["data"], VideoDataModule, "data")
     torch.manual_seed(0)
     simulator = build_simulator(config)
-    simulator.encoder.background.fit(*datamodule.median_background())  # type: ignore[union-attr, operator]
+    background = simulator.encoder.background
+    if background is not None and background.needs_fit:
+        background.fit(*datamodule.median_background())  # type: ignore[operator]
     simulator = simulator.to(options.device)
     losses = build_list(config["loss"], AbstractLoss, "loss")
     optimizer, _ = build(config["optimizer"], AbstractOptimization, "optimizer").build(simulator, warm_up + steps)
