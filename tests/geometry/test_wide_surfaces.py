@@ -103,3 +103,20 @@ def test_a_sharp_fold_divides_a_sheet_even_where_normals_along_it_turn_slowly():
     wide = told(points, normals, min_width=0.6, tolerance=1e-6)[0]
 
     assert wide[14:].all() and not wide[:11].any()
+
+
+def test_a_face_seen_from_the_side_is_not_linked_to_the_floor_far_behind_it():
+    # From the 14th column on the floor lies 5 m behind. A face ends there, whose tilt of 15 degrees points at it: the
+    # step from its last column down to the floor leaves either plane by half of that.
+    points, normals = sheet()
+    points[0, :, 15:, 0] += 5.0
+    face = (slice(8, 14), slice(9, 15))
+    tilt = np.radians(15)
+    points[0][face][..., 2] = 0.66 + np.tan(tilt) * (1.4 - points[0][face][..., 0])
+    normals[0][face] = np.sin(tilt), 0.0, np.cos(tilt)
+
+    wide = told(points, normals, min_width=0.3)[0]
+
+    expected = np.ones_like(wide)
+    expected[face] = False
+    assert np.array_equal(wide, expected)

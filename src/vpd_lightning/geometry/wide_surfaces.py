@@ -12,6 +12,10 @@ _NUM_TANGENT_PLANES = 4
 _MIN_STRAIGHTNESS = 0.7071067811865476
 """Cosine of 45 degrees: where a row or column of pixels bends by more between its steps, two surfaces meet."""
 
+_MAX_STEP_RATIO = 4.0
+"""Where one step along a row or column of pixels is longer than the next by more, depth jumps: on a plane, steps grow
+slowly but for the last two before its horizon. A body's edge may point along the jump, so that directions agree."""
+
 _MAX_SURFACE_POINTS = 2000
 """A wide surface is flat where it is held against; this many of its points are enough and keep the search cheap."""
 
@@ -75,8 +79,10 @@ def _bent(points: np.ndarray, valid: np.ndarray) -> Bool[np.ndarray, "view heigh
         along, there, found = (np.moveaxis(values, axis, 1) for values in (points, valid, bent))
         steps = along[:, 1:] - along[:, :-1]
         lengths = np.sqrt(_dot(steps, steps))
-        cosine = _dot(steps[:, 1:], steps[:, :-1])
-        found[:, 1:-1] |= (cosine < _MIN_STRAIGHTNESS * lengths[:, 1:] * lengths[:, :-1]) & there[:, 2:] & there[:, :-2]
+        before, after = lengths[:, :-1], lengths[:, 1:]
+        turns = _dot(steps[:, 1:], steps[:, :-1]) < _MIN_STRAIGHTNESS * before * after
+        jumps = np.maximum(before, after) > _MAX_STEP_RATIO * np.minimum(before, after)
+        found[:, 1:-1] |= (turns | jumps) & there[:, 2:] & there[:, :-2]
     return bent
 
 
