@@ -57,7 +57,9 @@ def _ray(
     direction: Array,
 ) -> list[float]:
     """Return red, green, blue, depth and opacity of one ray; ``positions`` and ``features`` hold no padding."""
-    behind_all = _sigmoid(_evaluate(background, direction))
+    waves = [np.exp(1j * np.pi * 2**octave * direction) for octave in range(renderer.background_frequencies)]
+    encoded = np.concatenate([direction, *(part for wave in waves for part in (wave.imag, wave.real))])
+    behind_all = _sigmoid(_evaluate(background, encoded))
     offsets = positions - origin
     along = offsets @ direction
     besides = offsets - np.outer(along, direction)
@@ -71,7 +73,7 @@ def _ray(
     border = np.min(along + 2 * np.sqrt(square)) + renderer.layer_depth
     how_far_in_front = (border - along) / (0.3 * renderer.layer_depth)
     inputs: list[Any] = []
-    distances = []
+    distances, colors = [], []
     for log_membership in (-np.logaddexp(0, -how_far_in_front), -np.logaddexp(0, how_far_in_front)):
         log_membership = np.maximum(log_membership, -30)
         for scale in renderer.kernel_scales:
@@ -81,9 +83,13 @@ def _ray(
             inputs += [weights @ features, weights @ besides / scale, [max(log_sum, -10) / 5]]
             if scale == renderer.kernel_scales[0]:
                 distances.append(weights @ along)
+                colors.append((weights @ features)[:3])
         inputs.append([np.log(1 + np.sum(np.exp(log_membership)))])
     outputs = _evaluate(network, np.concatenate([*inputs, direction]))
 
+    if renderer.color_features:
+        shown = np.clip(np.concatenate(colors), 0.01, 0.99)
+        outputs[:6] += np.log(shown / (1 - shown))
     front_color, back_color = _sigmoid(outputs[:3]), _sigmoid(outputs[3:6])
     front, back = _sigmoid(outputs[6:] + 1)
     back *= 1 - front

@@ -76,6 +76,13 @@ def test_unequal_feature_widths_are_refused():
         build_simulator(config)
 
 
+def test_stages_that_disagree_about_colours_among_the_features_are_refused():
+    config = compose("train", ["experiment=tiny", "model=inertial", "renderer.color_features=false"])
+
+    with pytest.raises(ConfigError, match=r"disagree.*\nencoder.color_features=true, renderer.color_features=false"):
+        build_simulator(config)
+
+
 def test_further_options_come_from_a_folder_of_ones_own(tmp_path: Path):
     (tmp_path / "encoder").mkdir()
     (tmp_path / "encoder" / "mine.yaml").write_text("defaults: [unet_small, _self_]\nnum_particles: 77\n")

@@ -47,9 +47,13 @@ def dataset(trajectories: Sequence[TrajectoryFrames], **changes: Any) -> ClipDat
     return ClipDataset(**{**settings, **changes})
 
 
-def moving_rays(trajectories: Sequence[TrajectoryFrames], fraction: float, threshold: float = 0.1) -> MovingRays:
+def moving_rays(
+    trajectories: Sequence[TrajectoryFrames], fraction: float, threshold: float = 0.1, margin: int = 0
+) -> MovingRays:
     rgb, depth = median_images(trajectories, [0, 1])
-    return MovingRays(fraction, threshold, threshold, rgb, depth)
+    return MovingRays(
+        fraction=fraction, margin=margin, color_threshold=threshold, depth_threshold=threshold, rgb=rgb, depth=depth
+    )
 
 
 def start_of(sample: ClipSample) -> tuple[str, int]:
@@ -144,6 +148,19 @@ def test_half_of_the_rays_go_to_moving_pixels(files: list[Path]) -> None:
     red = torch.stack([data[item].rgbs[..., 0] > 0.9 for item in range(20)])
     assert red[..., :16].all()  # the first half of each frame's rays; the square's red is 250
     assert 0.0 < red[..., 16:].float().mean() < 0.2  # uniform: the square covers 3.5 %
+
+
+@pytest.mark.parametrize("margin", [0, 1, 3])
+def test_pixels_within_the_margin_of_what_moves_count_as_moving(margin: int) -> None:
+    still, depth = np.zeros((2, 12, 10, 3), np.uint8), np.ones((2, 12, 10), np.float32)
+    rgb = still.copy()
+    rgb[1, 5, 9] = 200  # at the image border of the second view
+    rays = MovingRays(fraction=0.5, margin=margin, color_threshold=0.1, depth_threshold=0.1, rgb=still, depth=depth)
+
+    view, y, x = np.unravel_index(rays.find(rgb, depth), depth.shape)
+
+    expected = {(5 + down, 9 - left) for down in range(-margin, margin + 1) for left in range(margin + 1)}
+    assert set(view) == {1} and set(zip(y, x, strict=True)) == expected
 
 
 def test_rays_are_uniform_where_nothing_moves(files: list[Path]) -> None:

@@ -32,6 +32,8 @@ SETTINGS = {
     "mirror_hidden": True,
     "is_soft": False,
     "rest_share": 0.05,
+    "keep_shape": True,
+    "carry_memory": True,
     "shadow_scales": [0.1, 0.4],
 }
 FIRST_VELOCITY = {
@@ -157,6 +159,36 @@ def test_without_a_first_velocity_bodies_start_at_rest():
     states = roll(dynamics(first_velocity=None), previous, current, 3)
 
     assert torch.allclose(states[-1].positions, current.positions, atol=1e-12)
+
+
+def test_without_rigidity_a_spinning_body_flies_apart_and_its_middle_goes_on():
+    previous, current = tossed()
+    body = current.moving[0]
+
+    rigid, loose = (roll(dynamics(keep_shape=keep), previous, current, 6) for keep in (True, False))
+
+    # Each particle keeps to its line, as a tangent leaves its circle; damping takes 0.7 % of its speed a step.
+    first, last = ((state.positions - current.positions)[0, body] for state in (loose[0], loose[-1]))
+    assert (last - 6 * first).norm(dim=-1).max() < 0.05 * last.norm(dim=-1).max()
+    size = [pairwise(states[-1].positions[0, body]).mean() for states in ([current], rigid, loose)]
+    assert abs(size[1] / size[0] - 1) < 1e-9 and size[2] / size[0] > 1.02
+    apart = (loose[-1].positions - rigid[-1].positions)[0, body].mean(dim=0)
+    assert apart.norm() < 0.2 * (rigid[-1].positions - current.positions)[0, body].mean(dim=0).norm()
+
+
+def test_without_carried_memory_the_velocity_is_found_again_from_what_was_predicted():
+    previous, current = tossed()
+    body = current.moving[0]
+    carried, found = (roll(dynamics(carry_memory=keep), previous, current, 5) for keep in (True, False))
+
+    assert torch.equal(found[0].positions, carried[0].positions)
+    assert not torch.equal(found[1].positions, carried[1].positions)
+    moved = (carried[-1].positions - current.positions)[0, body].mean(dim=0)
+    # Free flight without forces: the estimate from two predicted frames, whose points are the same, is nearly exact.
+    assert ((found[-1].positions - carried[-1].positions)[0, body].mean(dim=0)).norm() < 0.1 * moved.norm()
+
+    standing = list(current.positions[0, ~body])
+    assert torch.equal(found[-1].positions[0, ~body], torch.stack(standing))
 
 
 def test_what_is_no_candidate_stays_exactly_where_it_is():

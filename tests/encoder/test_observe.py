@@ -30,6 +30,7 @@ def encoder(has_background=True):
         moving_fraction=0.5 if has_background else None,
         background=background if has_background else None,
         use_normals=True,
+        color_features=False,
     ).double()
 
 
@@ -98,7 +99,8 @@ def with_future(batch, num_steps):
 
 def simulator(has_background=True):
     renderer = SplatRenderer(
-        feature_dim=5, hidden_dim=16, num_layers=2, num_candidates=8, surface_scale=0.1, kernel_scales=[0.5, 2.0],
+        feature_dim=5, color_features=False, background_frequencies=0, hidden_dim=16,
+        num_layers=2, num_candidates=8, surface_scale=0.1, kernel_scales=[0.5, 2.0],
         layer_depth=1.0, near=0.1, far=10.0, ray_chunk_size=64, candidate_backend="auto",
     )  # fmt: skip
     return Simulator(

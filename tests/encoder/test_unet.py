@@ -38,6 +38,7 @@ def encoder(**changes):
         "moving_fraction": None,
         "background": None,
         "use_normals": False,
+        "color_features": False,
     }
     return UNetEncoder(**{**arguments, **changes})
 
@@ -163,6 +164,33 @@ def test_background_marks_what_stands_in_front_and_particles_favour_it():
     assert int(particles.moving.sum()) == 4
     assert (particles.positions[particles.moving][:, 2] > 0.4).all()
     assert "background.depth" in model.state_dict()
+
+
+def test_what_stands_still_takes_the_places_that_nothing_moving_fills():
+    data = frames(batch=1)
+    background = fitted_background(data)
+    closer = RGBDFrames(data.rgb, data.depth.clone(), data.cameras)
+    closer.depth[0, 1, 2:4, 2:4] = 1.5
+
+    model = encoder(moving_fraction=0.5, background=background)  # of 40 particles 20 may move, and four do
+    particles = model(closer, RandomKeys.fixed(1), "current").particles
+
+    assert particles.mask.all()
+    assert int(particles.moving.sum()) == 4
+    assert len(particles.positions[0].unique(dim=0)) == 40
+
+
+def test_the_first_features_are_the_colours_where_asked_for():
+    data = frames()
+    plain, colored = (encoder(color_features=asked) for asked in (False, True))
+    colored.load_state_dict(plain.state_dict())
+
+    before, now = (model(data, RandomKeys.fixed(2), "current").particles for model in (plain, colored))
+
+    assert torch.equal(now.features[..., :3], now.colors)
+    assert torch.equal(now.features[..., 3:], before.features[..., 3:])
+    with pytest.raises(ValueError, match="feature_dim of at least 3"):
+        encoder(channels=[4, 4, 2], color_features=True)
 
 
 def test_background_finds_its_cameras_in_any_order_and_refuses_strangers():

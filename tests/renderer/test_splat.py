@@ -14,6 +14,8 @@ from vpd_lightning.types import Particles, Rays
 
 SETTINGS = {
     "feature_dim": 5,
+    "color_features": True,
+    "background_frequencies": 2,
     "hidden_dim": 16,
     "num_layers": 2,
     "num_candidates": 8,
@@ -46,6 +48,32 @@ def rays(batch=2, count=20, seed=1):
     origins = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64).expand_as(targets)
     directions = targets - origins
     return Rays(origins, directions / directions.norm(dim=-1, keepdim=True))
+
+
+def perturb(model):
+    """Move the weights that start at zero, so that a test cannot pass without them."""
+    with torch.no_grad():
+        model.network[-1].weight += 0.3 * torch.randn_like(model.network[-1].weight)
+
+
+def test_before_training_a_surface_has_the_colours_of_its_particles():
+    axis = torch.linspace(-0.5, 0.5, 41, dtype=torch.float64)  # 2.5 cm apart, under a narrow kernel of 2 cm
+    places = torch.cartesian_prod(axis, axis, torch.zeros(1, dtype=torch.float64))[None]
+    colors = torch.where(places[..., :1] < 0, *torch.tensor([[[0.9, 0.2, 0.1]], [[0.1, 0.3, 0.8]]]).double()[:, None])
+    scene = Particles(places, torch.cat([colors, torch.zeros(1, len(places[0]), 2).double()], dim=-1))
+    x = torch.tensor([-0.4, -0.11, 0.11, 0.4], dtype=torch.float64)
+    targets = torch.stack([x, torch.full_like(x, 0.013), torch.zeros_like(x)], dim=-1)[None]
+    origins = targets + torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+    lines = Rays(origins, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand_as(origins))
+
+    model = renderer()
+    out = model(scene, lines, None)
+
+    behind = torch.sigmoid(model.background(model._encoded(lines.directions)))
+    left = 1 - out.opacities[..., None]
+    shown = (out.rgbs - left * behind) / (1 - left)
+    expected = torch.tensor([[0.9, 0.2, 0.1]] * 2 + [[0.1, 0.3, 0.8]] * 2, dtype=torch.float64)
+    assert (shown[0] - expected).abs().max() < 1e-3
 
 
 def test_colours_and_opacities_are_in_range():
@@ -114,7 +142,7 @@ def test_without_particles_a_ray_shows_the_background():
 
     out = model(empty, lines, None)
 
-    assert torch.allclose(out.rgbs, torch.sigmoid(model.background(lines.directions)))
+    assert torch.allclose(out.rgbs, torch.sigmoid(model.background(model._encoded(lines.directions))))
     assert (out.opacities == 0).all()
 
 
@@ -174,8 +202,11 @@ def sparse_scene(count, dtype=torch.float64):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("count", [0, 1, 5, 7, 8, 9, 300])
-def test_picture_equals_the_plain_one_for_any_number_of_particles(backend, count):
-    model, scene, lines = renderer(candidate_backend=backend), sparse_scene(count), rays(count=40)
+@pytest.mark.parametrize("starts", [True, False])
+def test_picture_equals_the_plain_one_for_any_number_of_particles(backend, count, starts):
+    model = renderer(candidate_backend=backend, color_features=starts, background_frequencies=2 * starts)
+    perturb(model)
+    scene, lines = sparse_scene(count), rays(count=40)
 
     fast, plain = model(scene, lines, None), splat_picture(model, scene, lines)
 
@@ -216,7 +247,7 @@ def test_a_ray_with_all_particles_behind_it_shows_the_background():
 
     out = model(behind, lines, None)
 
-    assert torch.allclose(out.rgbs, torch.sigmoid(model.background(lines.directions)), atol=1e-12)
+    assert torch.allclose(out.rgbs, torch.sigmoid(model.background(model._encoded(lines.directions))), atol=1e-12)
     assert (out.opacities == 0).all() and (out.depths == model.far).all()
     gradient, *_ = torch.autograd.grad(out.rgbs.sum(), behind.features)
     assert torch.equal(gradient, torch.zeros_like(gradient))

@@ -141,6 +141,7 @@ def tiny_data(folder: Path, **changes: Any) -> VideoDataModule:
         "target_views": None,
         "start_frames": None,
         "moving_ray_fraction": 0.5,
+        "moving_ray_margin": 1,
         "moving_color_threshold": 0.1,
         "moving_depth_threshold": 0.05,
         "cache": True,

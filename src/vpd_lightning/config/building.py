@@ -107,7 +107,7 @@ def is_of_stages(config: Mapping[str, Any]) -> bool:
 
 
 def check_widths(config: Mapping[str, Any]) -> None:
-    """Check that all stages agree on the width of particle features.
+    """Check that all stages agree on the width of particle features, and on whether these hold colours.
 
     Raises:
         ConfigError: they do not.
@@ -122,6 +122,13 @@ def check_widths(config: Mapping[str, Any]) -> None:
         raise ConfigError(
             f"the stages disagree on the width of particle features.\n{listed}.\n"
             "Set feature_dim=N at the root; all stages follow it."
+        )
+    colored = {name: part["color_features"] for name, part in sections.items() if "color_features" in part}
+    if len(set(colored.values())) > 1:
+        listed = ", ".join(f"{name}.color_features={str(value).lower()}" for name, value in colored.items())
+        raise ConfigError(
+            f"the stages disagree on whether features hold colours.\n{listed}.\n"
+            "Set color_features=true or false at the root; all stages follow it."
         )
 
 

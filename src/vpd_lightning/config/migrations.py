@@ -28,10 +28,17 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "max_abstract_edges_per_node": None,
         "feature_limit": 1e4,
     },
+    f"{_DYNAMICS}inertial.InertialDynamics": {"keep_shape": True, "carry_memory": True},
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},
     "vpd_lightning.simulator.Simulator": {"pixel_gradient_to_motion": 1.0},
     # kernel_scales and layer_depth were in metres.
-    f"{_RENDERER}splat.SplatRenderer": {"candidate_backend": "auto", "surface_scale": 1.0},
+    f"{_RENDERER}splat.SplatRenderer": {
+        "candidate_backend": "auto",
+        "surface_scale": 1.0,
+        "color_features": False,
+        "background_frequencies": 0,
+    },
+    "vpd_lightning.encoder.unet.UNetEncoder": {"color_features": False},
 }
 """By class: arguments added since the first checkpoints, with values that leave those models as they were."""
 

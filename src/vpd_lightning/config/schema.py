@@ -81,6 +81,7 @@ class TrainConfig:
     pretraining: PretrainingConfig | None = None
     seed: int = MISSING
     feature_dim: int = MISSING
+    color_features: bool = MISSING
     checkpoint_dynamics: bool = MISSING
     float32_matmul_precision: str = MISSING
     deterministic: bool = MISSING

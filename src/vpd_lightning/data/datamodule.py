@@ -29,7 +29,8 @@ class VideoDataModule(pl.LightningDataModule):
     that leaves room for the clip; ``num_trajectories`` null means the whole training split. ``num_steps_schedule``
     maps fractions of the training to rollout lengths and overrides ``num_steps`` in training (null: no schedule).
     ``moving_ray_fraction`` of the rays goes to pixels that differ from the per-camera training median by more than
-    the thresholds (largest colour channel, in [0, 1]; depth, in metres). With ``cache`` decoded frames stay in memory
+    the thresholds (largest colour channel, in [0, 1]; depth, in metres), or lie within ``moving_ray_margin`` pixels of
+    one that does. With ``cache`` decoded frames stay in memory
     (in each loader worker; with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
     the input views' images of the frames to predict.
     """
@@ -49,6 +50,7 @@ class VideoDataModule(pl.LightningDataModule):
         target_views: Sequence[int] | None,
         start_frames: Sequence[int] | None,
         moving_ray_fraction: float,
+        moving_ray_margin: int,
         moving_color_threshold: float,
         moving_depth_threshold: float,
         cache: bool,
@@ -71,7 +73,7 @@ class VideoDataModule(pl.LightningDataModule):
         self.batch_size, self.num_workers = batch_size, num_workers
         self.num_steps, self.num_steps_schedule, self.rays_per_step = num_steps, num_steps_schedule, rays_per_step
         self.input_views, self.target_views, self.start_frames = list(input_views), target_views, start_frames
-        self.moving_ray_fraction = moving_ray_fraction
+        self.moving_ray_fraction, self.moving_ray_margin = moving_ray_fraction, moving_ray_margin
         self.moving_color_threshold, self.moving_depth_threshold = moving_color_threshold, moving_depth_threshold
         self.cache = cache
         self.num_validation_clips, self.num_validation_steps = num_validation_clips, num_validation_steps
@@ -133,7 +135,12 @@ class VideoDataModule(pl.LightningDataModule):
         if self.moving_ray_fraction > 0:
             rgb, depth = self._median_images(target_views)
             moving_rays = MovingRays(
-                self.moving_ray_fraction, self.moving_color_threshold, self.moving_depth_threshold, rgb, depth
+                fraction=self.moving_ray_fraction,
+                margin=self.moving_ray_margin,
+                color_threshold=self.moving_color_threshold,
+                depth_threshold=self.moving_depth_threshold,
+                rgb=rgb,
+                depth=depth,
             )
         return ClipDataset(
             trajectories=self.trajectories,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float32, Int, UInt8
+from scipy.ndimage import maximum_filter
 from torch.utils.data import Dataset
 
 from vpd_lightning.data.collate import NUM_CONTEXT_FRAMES, ClipSample
@@ -24,6 +25,7 @@ class MovingRays:
     """
 
     fraction: float
+    margin: int
     color_threshold: float
     depth_threshold: float
     rgb: UInt8[np.ndarray, "view height width 3"]
@@ -32,11 +34,16 @@ class MovingRays:
     def __post_init__(self) -> None:
         if not 0.0 <= self.fraction <= 1.0:
             raise ValueError(f"moving_ray_fraction must lie in [0, 1], got {self.fraction}")
+        if self.margin < 0:
+            raise ValueError(f"moving_ray_margin must be a number of pixels from 0 up, got {self.margin}")
 
     def find(
         self, rgb: UInt8[np.ndarray, "view height width 3"], depth: Float32[np.ndarray, "view height width"]
     ) -> Int[np.ndarray, " pixel"]:
         """Return flat indices (view, y, x) of pixels whose colour or depth differs by more than the thresholds.
+
+        Pixels up to ``margin`` beside them count, too: where rays are drawn much more densely on one side of an outline
+        than on the other, a renderer learns to draw bodies too large.
 
         Colours differ by their largest channel, in [0, 1]; depths in metres, where both are measured.
         """
@@ -44,6 +51,9 @@ class MovingRays:
         moved = (high - low).max(axis=-1) > self.color_threshold * 255.0
         measured = np.isfinite(depth) & (depth > 0) & (self.depth > 0)
         moved |= measured & (np.abs(np.where(measured, depth, 0.0) - self.depth) > self.depth_threshold)
+        if self.margin:
+            width = 2 * self.margin + 1
+            moved = maximum_filter(moved, size=(1, width, width))
         return np.flatnonzero(moved).astype(np.int32)
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vpd_lightning.dynamics.rigid_motion import cross, rigid_fit, rotate, rotation_from_spin, weighted_sum
+from vpd_lightning.geometry.decay import decay
 
 _EVIDENCE = 0.3  # a match this strong (a perfect one counts 1) is believed by half
 _NUM_SPACED = 128  # points of which the spacing is measured
@@ -230,7 +231,7 @@ def match(
     # What is not there counts for nothing, and even where nothing is there the numbers stay finite.
     logits = logits.masked_fill(~target.mask[:, None], -1e4).clamp(min=-1e4)
     top = logits.detach().amax(dim=-1, keepdim=True)
-    kernel = torch.exp(logits - top)
+    kernel = decay(logits - top)
     total = kernel.sum(dim=-1, keepdim=True)
     weights = kernel / total
     return origin + weights @ goals, (total * torch.exp(top)).squeeze(-1), weights

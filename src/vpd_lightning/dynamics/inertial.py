@@ -49,13 +49,14 @@ class InertialMemory:
     masses: Float[Tensor, "batch body 1"]
     spacing: Float[Tensor, " batch"]  # of the moving candidates (metres)
     normals: Float[Tensor, "batch moving 3"]
+    velocities: Float[Tensor, "batch moving 3"]  # metres a step, where each particle goes on by itself
     mirrored: Bool[Tensor, "batch moving"]  # whose mirror image may be a point of the hidden side
     first_features: Float[Tensor, "batch moving feature"]
-    first_normals: Float[Tensor, "batch moving 3"]
+    first_shade: Float[Tensor, "batch moving feature"]
     static_index: Int[Tensor, "batch static"]
     static_mask: Bool[Tensor, "batch static"]
     static_features: Float[Tensor, "batch static feature"]
-    static_surroundings: Float[Tensor, "batch static channel"]  # where the moving ones were at first
+    static_shade: Float[Tensor, "batch static feature"]  # with the moving ones where they were at first
 
 
 class InertialDynamics(AbstractDynamics):
@@ -69,7 +70,12 @@ class InertialDynamics(AbstractDynamics):
     keep their place exactly. Features change only by shading: a turned surface, a moved shadow.
 
     Neither gravity nor a floor is built in: at initialisation this is free motion that contact alone changes, but for
-    0.7 % of damping a step. With ``first_velocity`` null, bodies start at rest.
+    0.7 % of damping a step.
+
+    For comparisons, each part can be left out: with ``first_velocity`` null bodies start at rest; with ``keep_shape``
+    false every particle goes on with its own velocity, to which it adds what its body's changes by; with
+    ``carry_memory`` false velocities and bodies are found anew from every two predicted frames; with ``rest_share``
+    zero nothing stops.
     """
 
     # Paper: the dynamics is a hierarchical GNN without velocities or correspondences; this one is ours
@@ -98,6 +104,8 @@ class InertialDynamics(AbstractDynamics):
         mirror_hidden: bool,
         is_soft: bool,
         rest_share: float,
+        keep_shape: bool,
+        carry_memory: bool,
         shadow_scales: Sequence[float],
     ):
         super().__init__()
@@ -116,7 +124,7 @@ class InertialDynamics(AbstractDynamics):
         self.force_scale, self.rest_share = force_scale, rest_share
         self.contact_range, self.contact_reach = contact_range, contact_reach
         self.num_contact_iterations, self.max_contact_depth = num_contact_iterations, max_contact_depth
-        self.mirror_hidden = mirror_hidden
+        self.mirror_hidden, self.keep_shape, self.carry_memory = mirror_hidden, keep_shape, carry_memory
         self.first_velocity = first_velocity
         self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
         self.forces = BodyForces(
@@ -159,10 +167,10 @@ class InertialDynamics(AbstractDynamics):
             centers = equidistant_centers(seen.positions, seen.normals, shares)
             static_index, static_mask = gather_index(current.mask & ~movable(current))
             static_positions = take(current.positions, static_index)
-            surroundings = self.static_shading.surroundings(static_positions, seen.positions, mask)
             mirrored = mask & self._may_be_hidden(current, seen, bodies, centers, static_index, static_mask)
             spacing = point_spacing(seen.positions, mask)
         materials = self.materials(seen.features, shares)
+        static_features = take(current.features, static_index)
         return InertialMemory(
             origin=origin,
             index=index,
@@ -174,13 +182,14 @@ class InertialDynamics(AbstractDynamics):
             masses=materials.density * _volumes(seen.positions, centers, shares),
             spacing=spacing,
             normals=seen.normals,
+            velocities=found.matched.displacements,
             mirrored=mirrored,
             first_features=seen.features,
-            first_normals=seen.normals,
+            first_shade=self.moving_shading(seen.features, seen.normals),
             static_index=static_index,
             static_mask=static_mask,
-            static_features=take(current.features, static_index),
-            static_surroundings=surroundings,
+            static_features=static_features,
+            static_shade=self.static_shading(static_features, static_positions, seen.positions, mask),
         )
 
     def _may_be_hidden(
@@ -206,6 +215,8 @@ class InertialDynamics(AbstractDynamics):
         current = current.without_padding()
         device_type = current.positions.device.type
         with torch.autocast(device_type, enabled=False):  # geometry in full precision
+            if not self.carry_memory and rollout_step > 0:
+                memory = self._first_memory(*observed(previous, current))
             return self._step(current, memory)
 
     def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
@@ -214,8 +225,11 @@ class InertialDynamics(AbstractDynamics):
         resolved = self._resolved(positions, static_positions, current.normals, memory)  # type: ignore[arg-type]
         step, onward = self._rested(resolved)
         own = memory.own
-        moved = vectors_of(step.centers + step.displacements, own)
-        moved = moved + step.turned(positions - vectors_of(step.centers, own), own)
+        moved = _carried(step, positions, own)
+        velocities = memory.velocities
+        if not self.keep_shape:
+            velocities = velocities + moved - _carried(memory.motion, positions, own)
+            moved = positions + velocities
         following = torch.where(memory.mask[..., None], moved, positions)
         turned = rotate(matrices_of(rotation_from_spin(step.spins), own), memory.normals)
         all_positions = put(current.positions, memory.index, following + memory.origin, memory.mask)
@@ -223,7 +237,7 @@ class InertialDynamics(AbstractDynamics):
         stretches, _ = step.following_stretches()
         _, strains = onward.following_stretches()
         onward = BodyMotion(step.centers + step.displacements, onward.displacements, onward.spins, stretches, strains)
-        memory = replace(memory, motion=onward, normals=turned)
+        memory = replace(memory, motion=onward, normals=turned, velocities=velocities)
         # Observations turn with their bodies, or a memory built from these particles would see faces that are gone.
         normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
         return replace(current, positions=all_positions, features=features, normals=normals), memory
@@ -320,13 +334,18 @@ class InertialDynamics(AbstractDynamics):
         self, current: Particles, memory: InertialMemory, static_positions: Tensor, following: Tensor, turned: Tensor
     ) -> Tensor:
         """Features are the observed ones plus what turned and what moved since; nothing accumulates."""
-        moving = memory.first_features
-        moving = moving + self.moving_shading(moving, memory.first_normals, turned)
-        surroundings = self.static_shading.surroundings(static_positions, following, memory.mask)
-        static = memory.static_features
-        static = static + self.static_shading(static, memory.static_surroundings, surroundings)
+        moving, static = memory.first_features, memory.static_features
+        moving = moving + (self.moving_shading(moving, turned) - memory.first_shade)
+        shade = self.static_shading(static, static_positions, following, memory.mask)
+        static = static + (shade - memory.static_shade)
         features = put(current.features, memory.index, moving, memory.mask)
         return put(features, memory.static_index, static, memory.static_mask)
+
+
+def _carried(motion: BodyMotion, positions: Tensor, own: Tensor) -> Float[Tensor, "batch moving 3"]:
+    """Return where points of bodies are after the step."""
+    offsets = positions - vectors_of(motion.centers, own)
+    return vectors_of(motion.centers + motion.displacements, own) + motion.turned(offsets, own)
 
 
 def _first_motion(positions: Tensor, displacements: Tensor, shares: Tensor, centers: Tensor) -> BodyMotion:

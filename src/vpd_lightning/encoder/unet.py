@@ -34,6 +34,7 @@ class UNetEncoder(UnprojectingEncoder):
         moving_fraction: float | None,
         background: AbstractBackground | None,
         use_normals: bool,
+        color_features: bool,
     ):
         super().__init__(
             network=UNetNetwork(channels=channels, in_channels=3),
@@ -44,6 +45,7 @@ class UNetEncoder(UnprojectingEncoder):
             moving_fraction=moving_fraction,
             background=background,
             use_normals=use_normals,
+            color_features=color_features,
         )
 
     def pixel_features(self, rgb: Float[Tensor, "*shape height width 3"]) -> Tensor:

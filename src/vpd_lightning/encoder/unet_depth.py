@@ -50,6 +50,7 @@ class DepthPredictingEncoder(UnprojectingEncoder):
             moving_fraction=None,
             background=None,
             use_normals=False,
+            color_features=False,
         )
         last = network.up[-1]
         assert isinstance(last, nn.Conv2d) and last.bias is not None

@@ -20,10 +20,12 @@ class UnprojectingEncoder(AbstractEncoder):
     """What encoders share whose particles are pixels: which pixels, and where they lie. A subclass brings features.
 
     ``num_particles`` are chosen uniformly at random among the pixels inside the workspace. With ``moving_fraction``
-    (and a ``background`` model) that share of them is chosen among pixels that may be moving.
+    (and a ``background`` model) up to that share of them is chosen among pixels that may be moving. With
+    ``color_features`` the first three features are the colours of the pixels, whatever the network says.
     """
 
-    # Paper: moving_fraction, background and use_normals are ours; None, None, False is the paper.
+    # Paper: moving_fraction, background, use_normals and color_features are ours; None, None, False, False is the
+    # paper.
 
     # What a person is told to look at where no pixel lies in the workspace.
     _empty_advice = "Check depth (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."
@@ -39,6 +41,7 @@ class UnprojectingEncoder(AbstractEncoder):
         moving_fraction: float | None,
         background: AbstractBackground | None,
         use_normals: bool,
+        color_features: bool,
     ):
         super().__init__()
         if num_particles < 1:
@@ -47,6 +50,8 @@ class UnprojectingEncoder(AbstractEncoder):
             raise ValueError(f"workspace_min {list(workspace_min)} must lie below workspace_max {list(workspace_max)}")
         if moving_fraction is not None and background is None:
             raise ValueError("moving_fraction needs a background model; set encoder.background or moving_fraction=null")
+        if color_features and feature_dim < 3:
+            raise ValueError(f"color_features needs a feature_dim of at least 3, got {feature_dim}")
         if moving_fraction is not None and not 0 < moving_fraction < 1:
             raise ValueError(f"moving_fraction must lie between 0 and 1, got {moving_fraction}")
         self.network = network
@@ -56,6 +61,7 @@ class UnprojectingEncoder(AbstractEncoder):
         self.moving_fraction = moving_fraction
         self.background = background
         self.use_normals = use_normals
+        self.color_features = color_features
 
     @staticmethod
     def _colors(frames: RGBDFrames) -> Float[Tensor, "batch view height width 3"]:
@@ -102,11 +108,14 @@ class UnprojectingEncoder(AbstractEncoder):
         def take(values: Tensor) -> Tensor:
             return torch.gather(values, 1, index[..., None].expand(-1, -1, values.shape[-1]))
 
+        colors, features = take(frames.rgb.flatten(1, 3)), features_at(index)
+        if self.color_features:
+            features = torch.cat([colors.to(features), features[..., 3:]], dim=-1)
         return Particles(
             positions=take(points) * valid[..., None],
-            features=features_at(index) * valid[..., None],
+            features=features * valid[..., None],
             mask=valid,
-            colors=take(frames.rgb.flatten(1, 3)),
+            colors=colors,
             moving=None if moving is None else torch.gather(moving, 1, index) & valid,
             normals=take(depth_normals(frames.depth, frames.cameras).flatten(1, 3)) if self.use_normals else None,
         )
@@ -148,8 +157,9 @@ class UnprojectingEncoder(AbstractEncoder):
             else:
                 num_moving = round(self.moving_fraction * self.num_particles)
                 moving_index, moving_valid = choose(allowed & moving[member], num_moving, generator)
-                index, valid = choose(allowed & ~moving[member], self.num_particles - num_moving, generator)
-                index, valid = torch.cat([moving_index, index]), torch.cat([moving_valid, valid])
+                found = int(moving_valid.sum())  # padding comes last; what does not move takes the places left over
+                index, valid = choose(allowed & ~moving[member], self.num_particles - found, generator)
+                index, valid = torch.cat([moving_index[:found], index]), torch.cat([moving_valid[:found], valid])
             indices.append(index)
             valids.append(valid)
         return torch.stack(indices), torch.stack(valids)

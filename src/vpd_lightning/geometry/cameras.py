@@ -27,7 +27,8 @@ def _camera_directions(cameras: Cameras, pixels: Float[Tensor, "*shape point 2"]
 def _rotate(cam_to_world: Float[Tensor, "*camera 4 4"], vectors: Float[Tensor, "*shape point 3"]) -> Tensor:
     """Rotate camera vectors to the world by explicit sums: autocast may not lower the precision of geometry."""
     rotation = cam_to_world[..., None, :3, :3]
-    return (rotation * vectors[..., None, :]).sum(dim=-1)
+    x, y, z = (vectors[..., axis : axis + 1] * rotation[..., axis] for axis in range(3))
+    return x + y + z
 
 
 def unproject(depth: Float[Tensor, "*shape height width"], cameras: Cameras) -> Float[Tensor, "*shape height width 3"]:

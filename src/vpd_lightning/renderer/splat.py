@@ -6,10 +6,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from vpd_lightning.geometry.decay import decay
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.ray_search import BesideAndBehind, RaySearch, check_backend
 from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
+
+_DARKEST = 0.01
+"""Colours nearer to 0 or 1 have no logit to add to."""
 
 
 class SplatRenderer(AbstractRenderer):
@@ -19,7 +23,9 @@ class SplatRenderer(AbstractRenderer):
     front layer and a back layer by their distance along the ray. Each layer gives the network its mean features under
     Gaussian kernels of ``kernel_scales``, the mean offset from the ray (whether the ray passes beside a silhouette),
     and its density. The network returns two colours and two opacities; a background of the view direction closes the
-    ray. A ray with no particle in front of its camera shows the background alone.
+    ray. With ``color_features`` the first three features of a particle are its colour, and the network says how a layer
+    differs from their mean under the first kernel. A ray with no particle in front of its camera shows the background
+    alone.
 
     ``surface_scale`` is in metres: about as far as a surface reaches beside and behind a particle on it.
     ``kernel_scales`` (widths beside the ray) and ``layer_depth`` (along it) are multiples of it.
@@ -31,6 +37,8 @@ class SplatRenderer(AbstractRenderer):
         self,
         *,
         feature_dim: int,
+        color_features: bool,
+        background_frequencies: int,
         hidden_dim: int,
         num_layers: int,
         num_candidates: int,
@@ -49,6 +57,8 @@ class SplatRenderer(AbstractRenderer):
                 "kernel_scales, layer_depth and surface_scale must be positive, got "
                 f"{list(kernel_scales)}, {layer_depth} and {surface_scale}"
             )
+        if background_frequencies < 0:
+            raise ValueError(f"background_frequencies must be at least 0, got {background_frequencies}")
         if num_candidates < 1 or ray_chunk_size < 1:
             raise ValueError(
                 f"num_candidates and ray_chunk_size must be at least 1, got {num_candidates}, {ray_chunk_size}"
@@ -66,8 +76,17 @@ class SplatRenderer(AbstractRenderer):
         layers: list[nn.Module] = []
         for i, o in zip(widths[:-1], widths[1:], strict=True):
             layers += [nn.Linear(i, o), nn.ReLU()]
-        self.network = nn.Sequential(*layers, nn.Linear(hidden_dim, 8))
-        self.background = nn.Sequential(nn.Linear(3, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, 3))
+        last = nn.Linear(hidden_dim, 8)
+        self.network = nn.Sequential(*layers, last)
+        self.color_features = color_features
+        if color_features:  # before training, a layer has the mean colour of its particles
+            with torch.no_grad():
+                last.weight[:6], last.bias[:6] = 0, 0
+        # Octaves of the direction, as in NeRF: what lies outside of the workspace has detail, too.
+        self.background_frequencies = background_frequencies
+        self.background = nn.Sequential(
+            nn.Linear(3 + 6 * background_frequencies, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, 3)
+        )
 
     def forward(self, particles: Particles, rays: Rays, keys: RandomKeys | None) -> RenderedRays:
         """Render rays (``batch ray 3``); nothing here is random, so ``keys`` is not used."""
@@ -101,15 +120,23 @@ class SplatRenderer(AbstractRenderer):
         with torch.autocast(device_type, enabled=False):
             inputs, depth, sees_any = self._layers(particles, index, origins, directions)
         outputs = self.network(torch.cat([inputs, directions], dim=-1)).to(origins.dtype)
-        colors = torch.sigmoid(outputs[..., :6]).unflatten(-1, (2, 3))
+        logits = outputs[..., :6].unflatten(-1, (2, 3))
+        if self.color_features:
+            means = inputs.unflatten(-1, (2, -1))[..., :3].to(logits.dtype)
+            logits = logits + torch.logit(means.clamp(_DARKEST, 1 - _DARKEST))
+        colors = torch.sigmoid(logits)
         alphas = torch.sigmoid(outputs[..., 6:] + 1.0)
-        background = torch.sigmoid(self.background(directions).to(origins.dtype))
+        background = torch.sigmoid(self.background(self._encoded(directions)).to(origins.dtype))
         alphas = alphas * sees_any
         front, back = alphas[..., :1], (1 - alphas[..., :1]) * alphas[..., 1:]
         left = 1 - front - back
         rgbs = front * colors[..., 0, :] + back * colors[..., 1, :] + left * background
         depths = (front * depth[..., :1] + back * depth[..., 1:] + left * self.far).squeeze(-1)
         return rgbs, depths, (front + back).squeeze(-1)
+
+    def _encoded(self, directions: Tensor) -> Float[Tensor, "batch ray channel"]:
+        octaves = [directions * (torch.pi * 2**octave) for octave in range(self.background_frequencies)]
+        return torch.cat([directions, *(wave(angle) for angle in octaves for wave in (torch.sin, torch.cos))], dim=-1)
 
     def _layers(
         self, particles: Particles, index: Tensor, origins: Tensor, directions: Tensor
@@ -131,21 +158,24 @@ class SplatRenderer(AbstractRenderer):
         memberships = nn.functional.logsigmoid(torch.stack([in_front, -in_front], dim=2)).clamp(min=-30.0)
         # What cannot be used, in particular what is behind the camera, counts for nothing at all.
         memberships = memberships.masked_fill(~usable[:, :, None], -1e30)
+        there = usable[:, :, None].to(along.dtype)
         scales = torch.tensor(self.kernel_scales, dtype=along.dtype, device=along.device)[:, None]
         logits = memberships[:, :, :, None] - (square[:, :, None] / (2 * scales.square()))[:, :, None]
-        weights = torch.softmax(logits, dim=-1)
+        top = logits.detach().amax(dim=-1, keepdim=True)
+        kernels = decay(logits - top) * there[:, :, :, None]
+        total = kernels.sum(dim=-1, keepdim=True).clamp(min=1e-30)  # at least 1, but where nothing is usable
+        weights = kernels / total
         # One product for all layers and scales: (layer * scale, candidate) @ (candidate, channel) of each ray.
-        values = torch.cat([gather(particles.features), beside, along[..., None]], dim=-1)
-        features, offsets, distances = (
-            (weights.flatten(2, 3) @ values)
-            .unflatten(2, logits.shape[2:4])
-            .split([particles.features.shape[-1], 3, 1], dim=-1)
+        features, offsets = (
+            (weights.flatten(2, 3) @ values).unflatten(2, logits.shape[2:4])
+            for values in (gather(particles.features), beside)
         )
-        visible = torch.logsumexp(logits, dim=-1, keepdim=True).clamp(min=-10.0) / 5
-        density = torch.log1p(memberships.exp().sum(dim=-1, keepdim=True))
+        distances = (weights[:, :, :, 0] * along[:, :, None]).sum(dim=-1)
+        visible = (top + torch.log(total)).clamp(min=-10.0) / 5
+        density = torch.log1p((decay(memberships) * there).sum(dim=-1, keepdim=True))
         inputs = torch.cat([features, offsets / scales, visible], dim=-1).flatten(3)
         inputs = torch.cat([inputs, density], dim=-1).flatten(2)
-        return inputs, distances[:, :, :, 0, 0], usable.any(dim=-1, keepdim=True)
+        return inputs, distances, usable.any(dim=-1, keepdim=True)
 
     @torch.no_grad()
     def _front(self, along: Tensor, square: Tensor, usable: Tensor) -> Float[Tensor, "batch ray 1"]:
