@@ -20,6 +20,7 @@ from vpd_lightning.simulator import Simulator
 FEATURE_DIM = 16
 ROOT = {
     "feature_dim": FEATURE_DIM,
+    "color_features": False,
     "checkpoint_dynamics": True,
 }  # keys of the root of conf/train.yaml
 USED = (

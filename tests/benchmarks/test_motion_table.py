@@ -1,0 +1,53 @@
+import json
+
+import pytest
+
+from benchmarks.motion_table import main, read_runs, table
+
+
+def metrics(psnr, errors):
+    reference = {"psnr": {"mean": 20.0}, "psnr_moving": {"mean": None}}
+    motion = {f"centroid_error{kind}": {"per_step": list(errors)} for kind in ("", "_constant", "_velocity")}
+    return {
+        "step": 100,
+        "psnr": {"mean": psnr},
+        "psnr_moving": {"mean": psnr - 5},
+        "chamfer": {"mean": 0.031},
+        "motion": motion,
+        "references": {"copy_last": reference, "train_mean": reference},
+    }
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for seed, psnr in enumerate((22.0, 24.0)):
+        folder = tmp_path / "block" / f"inertial_gnn_{seed}" / "evaluation"
+        folder.mkdir(parents=True)
+        errors = [0.01 * (step + seed) for step in range(1, 33)]
+        (folder / "metrics.json").write_text(json.dumps(metrics(psnr, errors)))
+    return tmp_path
+
+
+def test_a_cell_is_the_mean_over_seeds_with_its_range(runs):
+    row = next(line for line in table(read_runs(runs)).splitlines() if "inertial_gnn" in line)
+
+    assert (
+        "| block | inertial_gnn | 100 [100, 100] | 23.00 [22.00, 24.00] | 18.00 [17.00, 19.00] | 1.5 [1.0, 2.0] |"
+        in row
+    )
+    assert row.endswith("| 3.1 [3.1, 3.1] |")
+
+
+def test_references_and_numbers_of_every_run_are_kept(runs, tmp_path, capsys):
+    main([str(runs), "--out", str(tmp_path / "table.json")])
+
+    printed = capsys.readouterr().out
+    assert "| | *mean image* |  | 20.00 | - |" in printed
+    kept = json.loads((tmp_path / "table.json").read_text())
+    assert kept["block"]["inertial_gnn"]["1"]["step 4"] == pytest.approx(5.0)
+    assert kept["block"]["references"]["*best constant*"]["step 1"] == pytest.approx(1.0)
+
+
+def test_an_empty_folder_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no"):
+        read_runs(tmp_path)
