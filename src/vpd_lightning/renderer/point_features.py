@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vpd_lightning.geometry.decay import decay
 from vpd_lightning.graph.neighbors import Neighbors
 from vpd_lightning.renderer.precision import at_least_float32, full_precision
 from vpd_lightning.types import Particles
@@ -63,7 +62,7 @@ def kernel_weights(
     radii = torch.as_tensor(kernel_radii, dtype=distance.dtype, device=distance.device)
     bandwidths = torch.as_tensor(kernel_bandwidths, dtype=distance.dtype, device=distance.device)
     scaled = (distance[..., None] - radii) / bandwidths
-    return decay(-scaled.square()) * mask[..., None]
+    return torch.exp(-scaled.square()) * mask[..., None]
 
 
 def safe_norm(vector: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
