@@ -9,9 +9,16 @@ from vpd_lightning.graph.bodies import label_bodies
 SETTINGS = {"num_bodies": 6, "link": 1.7, "max_concavity": 0.15, "max_concave_share": 0.35}
 
 
-def labelled(positions, normals, mask=None, **changes):
+def labelled(positions, normals, mask=None, colors=None, **changes):
+    """Label the particles of one scene; without colours the bodies are motley, and colour says nothing."""
     mask = torch.ones(len(positions), dtype=torch.bool) if mask is None else mask
-    return label_bodies(positions[None], normals[None], mask[None], **{**SETTINGS, **changes})[0]
+    colors = motley(positions) if colors is None else colors
+    return label_bodies(positions[None], normals[None], colors[None], mask[None], **{**SETTINGS, **changes})[0]
+
+
+def motley(positions):
+    """Red, green or blue, by the order of the particles."""
+    return torch.eye(3, dtype=positions.dtype)[torch.arange(len(positions)) % 3]
 
 
 def joined(*bodies):
@@ -78,14 +85,19 @@ def kissing(seed):
     return joined((*random_ball(300, seed), (0, 0, 0)), (*random_ball(300, seed + 20), (0.3, 0, 0)))
 
 
+def seen_from_above(positions, normals, truth):
+    """What two cameras see."""
+    directions = torch.tensor([[0.6, 0.2, 0.7], [-0.5, 0.4, 0.7]], dtype=torch.float64)
+    seen = (normals @ directions.T > 0).any(dim=-1)
+    return positions[seen], normals[seen], truth[seen]
+
+
 def share_parted(make, **changes):
     """In which share of random drawings two bodies that touch are told apart, as two cameras from above see them."""
-    directions = torch.tensor([[0.6, 0.2, 0.7], [-0.5, 0.4, 0.7]], dtype=torch.float64)
     parted = []
     for seed in range(12):
-        positions, normals, truth = make(seed)
-        seen = (normals @ directions.T > 0).any(dim=-1)
-        parted.append(agreement(labelled(positions[seen], normals[seen], **changes), truth[seen]) > 0.93)
+        positions, normals, truth = seen_from_above(*make(seed))
+        parted.append(agreement(labelled(positions, normals, **changes), truth) > 0.93)
     return sum(parted) / len(parted)
 
 
@@ -104,6 +116,29 @@ def test_cubes_side_by_side_are_told_apart_with_the_settings_of_conf():
 @pytest.mark.parametrize("make", [stacked, kissing])
 def test_a_cube_on_a_cube_and_two_balls_are_told_apart_with_the_settings_of_conf(make):
     assert share_parted(make) >= 0.5
+
+
+def test_neighbours_of_one_colour_are_parts_of_one_body_and_others_are_not():
+    positions, normals, truth = seen_from_above(*side_by_side(0))
+    red, pink, blue = (
+        torch.tensor(color, dtype=torch.float64) for color in ([0.8, 0.1, 0.1], [0.56, 0.07, 0.07], [0.1, 0.1, 0.8])
+    )
+
+    def with_colors(first, second):
+        return labelled(positions, normals, colors=torch.where((truth == 0)[:, None], first, second))
+
+    assert len(with_colors(red, red).unique()) == 1
+    assert len(with_colors(red, pink).unique()) == 1  # in the shade
+    assert len(with_colors(red, blue).unique()) == 2
+    assert len(labelled(positions, normals).unique()) == 2
+
+
+def test_bodies_of_one_colour_apart_are_two():
+    positions, normals, truth = joined((*random_cube(200, 0), (0, 0, 0.15)), (*random_cube(150, 9), (0.5, 0.1, 0.15)))
+
+    labels = labelled(positions, normals, colors=torch.full_like(positions, 0.5))
+
+    assert torch.equal(labels, truth)
 
 
 def test_bodies_beyond_the_wanted_number_join_the_nearest():
@@ -191,9 +226,8 @@ def test_padding_is_no_body_and_members_do_not_see_each_other():
     positions[~mask], normals[~mask] = float("nan"), 1e6
     empty = torch.zeros_like(mask)
 
-    labels = label_bodies(
-        torch.stack([positions, positions]), torch.stack([normals, normals]), torch.stack([mask, empty]), **SETTINGS
-    )
+    both = [torch.stack([values, values]) for values in (positions, normals, motley(positions))]
+    labels = label_bodies(*both, torch.stack([mask, empty]), **SETTINGS)
 
     assert labels.shape == (2, len(mask)) and labels.dtype == torch.int64
     assert torch.equal(labels[0], torch.where(mask, truth, -1))

@@ -63,6 +63,7 @@ def find_first_motion(
     labels = label_bodies(
         near.positions,
         seen.normals,
+        seen.colors,
         mask,
         num_bodies=num_bodies,
         link=body_link,

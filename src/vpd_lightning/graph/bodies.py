@@ -1,5 +1,7 @@
 """Which particles hang together as one body: islands of convexly connected particles."""
 
+from itertools import combinations
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -20,6 +22,12 @@ _JOIN_SHARE = 0.8
 _PART_SHARE = 0.08
 """An island of at most this share of another one may be a sparsely seen part of it."""
 
+_SAME_TONE, _MAX_TONE_SPREAD = 0.06, 0.15
+"""Islands of one colour each (standard deviation of its chromaticity) and of the same colour are parts of one body."""
+
+_SAME_TONE_REACH = 2.5
+"""How many spacings of the wider-spaced one such parts may lie apart: what is between them may be hidden."""
+
 _MIN_PARTICLES, _MIN_SHARE = 8, 0.0125
 """An island of fewer particles is no body. One of a smaller share of all is one only if no other island is near."""
 
@@ -28,6 +36,7 @@ _MIN_PARTICLES, _MIN_SHARE = 8, 0.0125
 def label_bodies(
     positions: Float[Tensor, "batch particle 3"],
     normals: Float[Tensor, "batch particle 3"],
+    colors: Float[Tensor, "batch particle 3"],
     mask: Bool[Tensor, "batch particle"],
     *,
     num_bodies: int,
@@ -41,7 +50,8 @@ def label_bodies(
     hollow: (n_i - n_j) . (x_i - x_j) / |x_i - x_j| is at least ``-max_concavity`` (after the convexity criterion of
     Stein et al. 2014, "Object partitioning using local convexity"). Bodies that touch meet in a hollow. A particle with
     more than ``max_concave_share`` of hollow pairs links with none: in a touch there may be a single pair that is not.
-    Islands between which nearly all pairs are not hollow are joined again.
+    Islands between which nearly all pairs are not hollow are joined again, and neighbours of one colour each, the same:
+    hollow bodies, which convexity alone would divide. So two bodies of one colour that touch are taken for one.
     What is in no island of some size, and islands beyond ``num_bodies``, joins the nearest body. Scene by scene, on
     the CPU; the numbers do not depend on the order of the particles, on the place of the world or its scale.
     """
@@ -49,10 +59,11 @@ def label_bodies(
     for member, own in enumerate(mask.cpu()):
         if bool(own.any()):
             where = own.nonzero().flatten()
-            points, directions = (
-                values[member].detach().to("cpu", torch.float64)[where].numpy() for values in (positions, normals)
+            points, directions, tones = (
+                values[member].detach().to("cpu", torch.float64)[where].numpy()
+                for values in (positions, normals, colors)
             )
-            found = _label(points, directions, num_bodies, link, max_concavity, max_concave_share)
+            found = _label(points, directions, tones, num_bodies, link, max_concavity, max_concave_share)
             labels[member, where] = torch.from_numpy(found)
     return labels.to(mask.device)
 
@@ -82,9 +93,31 @@ def _joined(
     return _islands(low[join], high[join], count)[islands]
 
 
+def _joined_by_color(islands: np.ndarray, points: np.ndarray, colors: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """Join islands near each other that have one colour, the same; see ``_SAME_TONE``."""
+    sizes = np.bincount(islands)
+    large = np.flatnonzero(sizes >= _MIN_PARTICLES)
+    tones = colors / (colors.sum(axis=-1, keepdims=True) + 0.15)  # as in dynamics.first_velocity.chromaticity
+    parts = [np.flatnonzero(islands == number) for number in large]
+    means = [tones[part].mean(axis=0) for part in parts]
+    plain = [number for number, part in enumerate(parts) if tones[part].var(axis=0).sum() < _MAX_TONE_SPREAD**2]
+    joined = []
+    for first, second in combinations(plain, 2):
+        if np.linalg.norm(means[first] - means[second]) < _SAME_TONE:
+            one, other = parts[first], parts[second]
+            reach = _SAME_TONE_REACH * max(np.median(spacing[one]), np.median(spacing[other]))
+            distances, _ = cKDTree(points[one]).query(points[other], distance_upper_bound=reach)
+            if np.isfinite(distances).any():
+                joined.append((large[first], large[second]))
+    if not joined:
+        return islands
+    return _islands(*np.array(joined).T, len(sizes))[islands]
+
+
 def _label(
     points: np.ndarray,
     normals: np.ndarray,
+    colors: np.ndarray,
     num_bodies: int,
     link: float,
     max_concavity: float,
@@ -117,6 +150,7 @@ def _label(
     islands = _joined(islands, first, second, convex, 1.0)
     # Where a surface is seen from the side its points lie wide apart: such parts belong to a body, but are none.
     islands = _joined(islands, senders, receivers, smooth, _PART_SHARE)
+    islands = _joined_by_color(islands, points, colors, spacing)
 
     sizes = np.bincount(islands)
     centers = np.stack([np.bincount(islands, points[:, axis]) for axis in range(3)], axis=-1) / sizes[:, None]
