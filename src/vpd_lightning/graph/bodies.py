@@ -111,7 +111,8 @@ def _joined_by_color(islands: np.ndarray, points: np.ndarray, colors: np.ndarray
                 joined.append((large[first], large[second]))
     if not joined:
         return islands
-    return _islands(*np.array(joined).T, len(sizes))[islands]
+    senders, receivers = np.array(joined).T
+    return _islands(senders, receivers, len(sizes))[islands]
 
 
 def _label(
