@@ -19,7 +19,7 @@ _SPARSEST = 2.5
 _JOIN_SHARE = 0.8
 """Islands between which at least this share of the pairs is not hollow are parts of one body."""
 
-_PART_SHARE = 0.08
+_PART_SHARE = 0.25
 """An island of at most this share of another one may be a sparsely seen part of it."""
 
 _SAME_TONE, _MAX_TONE_SPREAD = 0.06, 0.15
