@@ -70,6 +70,18 @@ def test_value_is_that_of_loops(num_particles):
     assert value.shape == () and value.item() == pytest.approx(sum(expected) / 2, rel=1e-9)
 
 
+def test_autocast_leaves_the_geometry_alone():
+    output, batch = made(), video_batch(2)
+    single = {name: v.float() if v.is_floating_point() else v for name, v in output.auxiliary.items()}  # autocast's own
+    output = replace(output, states=[state.to(torch.float32) for state in output.states], auxiliary=single)
+
+    value = loss()(output, batch)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        lowered = loss()(output, batch)
+
+    assert torch.equal(lowered, value)
+
+
 def with_leaves(output):
     leaves = [state.positions.clone().requires_grad_() for state in output.states]
     return replace(output, states=[replace(s, positions=p) for s, p in zip(output.states, leaves, strict=True)]), leaves

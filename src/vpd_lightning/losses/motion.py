@@ -55,12 +55,17 @@ class MotionLoss(AbstractLoss):
         positions = torch.stack([_take(state.positions, index) for state in output.states], dim=1)
         colors = _take(first.colors, index)[:, None].expand_as(positions)
         seen, seen_colors = output.auxiliary["future_positions"], output.auxiliary["future_colors"]
-        seen_mask = output.auxiliary["future_mask"]
+        valid = valid[:, None].expand(positions.shape[:-1])
+        with torch.autocast(positions.device.type, enabled=False):  # geometry in full precision: squares cancel
+            return self._evidence_cost(positions, colors, valid, seen, seen_colors, output.auxiliary["future_mask"])
+
+    def _evidence_cost(
+        self, positions: Tensor, colors: Tensor, valid: Tensor, seen: Tensor, seen_colors: Tensor, seen_mask: Tensor
+    ) -> Float[Tensor, ""]:
         middle = positions[:, :1].mean(dim=2, keepdim=True).detach()  # far from the origin, squares have few digits
         square = _squared_distances(positions - middle, seen - middle)
         tone = _squared_distances(colors, seen_colors) / (2 * self.color_scale**2)
-        weights = [valid[:, None].expand(positions.shape[:-1]), seen_mask]
-        particles, points = (weight.to(square.dtype) for weight in weights)
+        particles, points = valid.to(square.dtype), seen_mask.to(square.dtype)
         total = []
         for scale in self.scales:
             evidence = decay(square * (-0.5 / scale**2) - tone)
