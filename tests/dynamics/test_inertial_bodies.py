@@ -1,5 +1,7 @@
 """Several bodies in one scene of the inertial dynamics."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -46,3 +48,25 @@ def test_more_bodies_than_places_and_no_bodies_are_borne():
     for num_bodies in (1, 2, 6):
         states = roll(dynamics(num_bodies=num_bodies), previous, current, 2)
         assert torch.isfinite(states[-1].positions).all()
+
+
+@pytest.mark.parametrize(("gap", "hears"), [(0.4, False), (0.05, True)])
+def test_learned_forces_on_a_body_know_of_others_in_reach_alone(gap, hears):
+    """A body that was left alone by an edit moves as one whose neighbours are out of reach."""
+    previous, current = two_cubes(gap)
+    model = dynamics(num_probes=240)
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for layer in (model.forces.force, model.forces.damping, model.forces.weight):
+            layer.weight.copy_(torch.randn(layer.weight.shape, generator=generator, dtype=torch.float64))
+    alone = [replace(frame, mask=frame.mask & ~_second(frame)) for frame in (previous, current)]
+
+    together, by_itself = (roll(model, *frames, 1)[-1].positions[0, :120] for frames in ((previous, current), alone))
+
+    difference = (together - by_itself).norm(dim=-1).max().item()
+    assert difference > 1e-4 if hears else difference < 1e-5  # metres; matches are drawn anew
+    assert (together - current.positions[0, :120]).norm(dim=-1).max() > 1e-3
+
+
+def _second(frame):
+    return (torch.arange(frame.num_particles) // 120 == 1)[None]

@@ -6,9 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.dynamics.solids import cube, rotation_about
 from vpd_lightning.dynamics.rigid_motion import (
-    anchor_weights,
     equidistant_centers,
-    farthest_points,
     fit_twists,
     rigid_fit,
     rotate,
@@ -94,17 +92,6 @@ def test_a_fit_of_hardly_any_points_is_a_finite_rotation(count):
     assert torch.linalg.det(found[0, 0]).item() == pytest.approx(1.0)
     if count:
         assert torch.allclose(there - here, torch.full_like(here, 0.1))
-
-
-def test_anchors_are_valid_particles_and_weights_ignore_padding():
-    positions, _, _ = cube(30, seed=2)
-    mask = (torch.arange(30) < 20)[None]
-
-    anchors = farthest_points(positions[None], mask, 6)
-    weights = anchor_weights(anchors, positions[None], mask, 0.2)
-
-    assert all((anchor == positions[:20]).all(-1).any() for anchor in anchors[0])
-    assert (weights[0, :, 20:] == 0).all() and (weights[0, :, :20] > 0).all()
 
 
 def test_rotate_is_a_matrix_product():

@@ -81,14 +81,23 @@ class BodyForces(nn.Module):
         relative = (motion.centers[:, :, None] - motion.centers[:, None]) / self.contact_range
         distance = relative.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
         count = body.shape[1]
-        # A body hears the others that are there, itself included.
         there = (weights.sum(dim=-1) > 0).to(body.dtype)
-        heard = (there / there.sum(dim=1, keepdim=True).clamp(min=1))[:, None, :, None]
+        heard = self._heard(distance, there)
         for message, update in zip(self.messages, self.updates, strict=True):
             pair = [body[:, :, None].expand(-1, -1, count, -1), body[:, None].expand(-1, count, -1, -1)]
             received = (message(torch.cat([*pair, relative, distance], dim=-1)) * heard).sum(dim=2)
             body = body + update(torch.cat([body, received], dim=-1))
         return self._push(positions, share, probe, body, there, motion, inertia)
+
+    def _heard(
+        self, distances: Float[Tensor, "batch body body 1"], there: Float[Tensor, "batch body"]
+    ) -> Float[Tensor, "batch body body 1"]:
+        """Return what each body hears of each, itself most: less with distance, nothing beyond the contact range.
+
+        So a body that is alone moves as one whose neighbours are far away, which training shows.
+        """
+        nearness = (1 - distances.square()).clamp(min=0).square() * there[:, None, :, None]
+        return nearness / nearness.sum(dim=2, keepdim=True).clamp(min=1)
 
     def _probe_inputs(self, displacements: Tensor, contacts: Contacts) -> Tensor:
         normal_speed = (displacements * contacts.normals).sum(dim=-1, keepdim=True)

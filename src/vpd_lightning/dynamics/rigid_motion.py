@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -43,15 +43,6 @@ def fit_twists(
     momentum = (weights[..., None] * cross(middle, displacements[:, None] - mean[:, :, None])).sum(dim=2)
     spins = torch.linalg.solve(_inertia(middle, weights), momentum)
     return Twists(center, mean, spins)
-
-
-def invert_inertia(
-    positions: Float[Tensor, "batch particle 3"],
-    centers: Float[Tensor, "batch anchor 3"],
-    weights: Float[Tensor, "batch anchor particle"],
-) -> Float[Tensor, "batch anchor 3 3"]:
-    """Return the inverse inertia about the centres of unit masses spread over the particles by ``weights``."""
-    return torch.linalg.inv(_inertia(positions[:, None] - centers[:, :, None], weights))
 
 
 def equidistant_centers(
@@ -103,36 +94,6 @@ def rotation_from_spin(spins: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batc
 def rotate(rotation: Float[Tensor, "*#batch 3 3"], vectors: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "... 3"]:
     """Rotate vectors by explicit sums, so that autocast cannot lower their precision."""
     return (rotation * vectors[..., None, :]).sum(dim=-1)
-
-
-def farthest_points(
-    positions: Float[Tensor, "batch particle 3"], mask: Bool[Tensor, "batch particle"], count: int
-) -> Float[Tensor, "batch anchor 3"]:
-    """Choose well-spread anchors among the valid particles, the first nearest to their mean; repeats when too few."""
-    total = mask.sum(dim=1, keepdim=True).clamp(min=1)
-    mean = (positions * mask[..., None]).sum(dim=1) / total
-    gap = (positions - mean[:, None]).square().sum(dim=-1).masked_fill(~mask, float("inf"))
-    index = gap.argmin(dim=1)
-    batch = torch.arange(len(positions), device=positions.device)
-    chosen = [positions[batch, index]]
-    nearest = torch.full_like(gap, float("inf"))
-    for _ in range(count - 1):
-        nearest = torch.minimum(nearest, (positions - chosen[-1][:, None]).square().sum(dim=-1))
-        index = nearest.masked_fill(~mask, -1.0).argmax(dim=1)
-        chosen.append(positions[batch, index])
-    return torch.stack(chosen, dim=1)
-
-
-def anchor_weights(
-    anchors: Float[Tensor, "batch anchor 3"],
-    positions: Float[Tensor, "batch particle 3"],
-    mask: Bool[Tensor, "batch particle"],
-    radius: float,
-) -> Float[Tensor, "batch anchor particle"]:
-    """Gaussian affinity of particles to anchors; zero for padding. Not normalised."""
-    square = (anchors[:, :, None] - positions[:, None]).square().sum(dim=-1)
-    # The floor keeps a particle that is far from every anchor attached to all of them instead of to none.
-    return (torch.exp(-square / (2 * radius**2)) + 1e-6) * mask[:, None]
 
 
 def rigid_fit(
