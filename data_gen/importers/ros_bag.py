@@ -133,7 +133,10 @@ def _image_topics(bag: Bag, topics: dict[str, str], mapping: RosMapping) -> dict
             raise DataError(f"{bag.path} has no images on {topic}.\nIt has {', '.join(sorted(images)) or 'none'}.")
     found = {}
     for topic in wanted or images:
-        _, _, message = next(bag.scan([topic]))
+        first = next(bag.scan([topic]), None)
+        if first is None:
+            raise DataError(f"{bag.path} is damaged: its index counts messages on {topic}, and there are none.")
+        message = first[2]
         try:
             found[topic] = image_topic(topic, message)
         except DataError:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from vpd_lightning.errors import ConfigError, DataError
+from vpd_lightning.errors import ConfigError, DataError, one_line
 
 IMAGE, COMPRESSED_IMAGE, CAMERA_INFO = (
     "sensor_msgs/msg/Image",
@@ -103,7 +103,9 @@ class Bag:
             except StopIteration:
                 return
             except Exception as error:  # rosbags' own, and struct, zstd, lz4 and SQLite errors from damaged bytes
-                raise DataError(f"{self.path} is damaged or cut short ({type(error).__name__}: {error}).") from error
+                raise DataError(
+                    f"{self.path} is damaged or cut short ({type(error).__name__}: {one_line(error)})."
+                ) from error
             yield connection.topic, time, lambda c=connection, r=raw: self._decode(c, r)
 
     def _decode(self, connection: Any, raw: bytes) -> Any:
@@ -112,7 +114,9 @@ class Bag:
         try:
             return self._open().deserialize(raw, connection.msgtype)
         except (AnyReaderError, struct.error, ValueError, IndexError, AssertionError) as error:
-            raise DataError(f"{self.path}: a message of {connection.topic} cannot be decoded ({error}).") from error
+            raise DataError(
+                f"{self.path}: a message of {connection.topic} cannot be decoded ({one_line(error)})."
+            ) from error
 
     def _open(self) -> Any:
         if self._reader is not None:
@@ -133,7 +137,7 @@ class Bag:
         except Exception as error:
             hint = "\nrosbag reindex may mend it." if "index" in str(error) else ""
             raise DataError(
-                f"{self.path} cannot be opened as a ROS bag ({type(error).__name__}: {error}).{hint}"
+                f"{self.path} cannot be opened as a ROS bag ({type(error).__name__}: {one_line(error)}).{hint}"
             ) from error
         self._reader = reader
         Bag._opened = self

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from data_gen.importers.conventions import checked_pose
 from data_gen.settings import did_you_mean
-from vpd_lightning.errors import ConfigError
+from vpd_lightning.errors import ConfigError, one_line
 
 _TOP_KEYS = ("world_frame", "cameras")
 _CAMERA_KEYS = ("name", "rgb", "depth", "info", "frame", "cam_to_world", "depth_scale", "is_aligned")
@@ -62,7 +62,7 @@ def read_ros_mapping(path: Path) -> RosMapping:
     try:
         values = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"mapping={path} cannot be read as YAML ({error}).") from error
+        raise ConfigError(f"mapping={path} cannot be read as YAML ({one_line(error)}).") from error
     if not isinstance(values, dict) or not isinstance(values.get("cameras", []), list):
         raise ConfigError(f"{path}: 'cameras' with a list of rgb and depth topics was expected.")
     _refuse_unknown(values, _TOP_KEYS, path)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.importers.crc32c import masked_crc32c
-from vpd_lightning.errors import DataError
+from vpd_lightning.errors import DataError, one_line
 
 FeatureValues = list[memoryview] | NDArray[np.float32] | NDArray[np.int64]
 _HEADER = 12  # length and its checksum
@@ -112,7 +112,7 @@ def parse_example(data: bytes | memoryview, names: Collection[str], where: objec
                     for feature in _delimited(entry, 2):
                         found[name] = _feature(feature)
     except (ValueError, struct.error) as error:
-        raise DataError(f"{where}: the data are not a tf.train.Example ({error}).") from error
+        raise DataError(f"{where}: the data are not a tf.train.Example ({one_line(error)}).") from error
     return found
 
 

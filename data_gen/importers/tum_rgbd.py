@@ -33,7 +33,7 @@ from data_gen.importers.images import image_size, read_color, read_depth
 from data_gen.importers.recording import MIN_FRAMES, Recording
 from data_gen.importers.settings import ImportSettings, chosen
 from data_gen.importers.source_files import inside
-from vpd_lightning.errors import DataError
+from vpd_lightning.errors import DataError, one_line
 
 FORMAT = "tum"
 _LISTS = ("rgb.txt", "depth.txt", "groundtruth.txt")
@@ -186,7 +186,7 @@ def _read_calibration(file: Path) -> tuple[list[float], list[float], float]:
         distortion = [float(value) for value in values.get("distortion", [0.0] * 5)]
         scale = float(values.get("depth_scale", _METRES_PER_STEP))
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{file} lacks the numbers fx, fy, cx, cy, or is no YAML ({error}).") from error
+        raise DataError(f"{file} lacks the numbers fx, fy, cx, cy, or is no YAML ({one_line(error)}).") from error
     if len(distortion) not in (4, 5, 8) or not np.isfinite(distortion).all() or not 0 < scale < float("inf"):
         raise DataError(f"{file}: distortion must be 4, 5 or 8 numbers (k1 k2 p1 p2 ...), depth_scale above 0.")
     return numbers, distortion + [0.0] * (len(distortion) == 4), scale

@@ -41,3 +41,9 @@ class OutOfMemoryError(VPDError):
 
 class NonFiniteError(VPDError):
     """A loss or gradient became NaN or infinite; raised before the optimiser could use it."""
+
+
+def one_line(error: BaseException, limit: int = 200) -> str:
+    """Return what another library said, as one line of at most ``limit`` characters: some say pages."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= limit else f"{text[: limit - 3]}..."

@@ -82,15 +82,15 @@ def test_killed_between_checkpoints_and_resumed(
     assert_equal_runs(uninterrupted, tmp_path)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGUSR1, 138)])
 def test_a_signal_saves_the_step_at_hand_and_gives_its_exit_code(
     data: Path, uninterrupted: Path, tmp_path: Path, number: int, code: int
 ) -> None:
-    handlers = [signal.getsignal(item) for item in (signal.SIGTERM, signal.SIGINT)]
+    handlers = [signal.getsignal(item) for item in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)]
     with pytest.raises(SystemExit) as stop:
         tiny_trainer(tmp_path, STEPS, [SignalAt(17, number)]).fit(tiny_module(), tiny_data(data))
     assert stop.value.code == code
-    assert handlers == [signal.getsignal(item) for item in (signal.SIGTERM, signal.SIGINT)]
+    assert handlers == [signal.getsignal(item) for item in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)]
     assert load_checkpoint(tmp_path / "checkpoints" / "last.ckpt")["global_step"] == 18
     resume(data, tmp_path)
     assert_equal_runs(uninterrupted, tmp_path)

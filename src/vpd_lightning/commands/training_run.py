@@ -14,6 +14,7 @@ import torch
 import yaml
 from lightning.pytorch import Callback, LightningDataModule, Trainer
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from vpd_lightning.commands.environment import environment
 from vpd_lightning.commands.first_training import FirstTraining, hand_over, train_first
@@ -100,13 +101,18 @@ def fit(
         "trainer",
         logger=build_list(config["logger"], Logger, "logger") or False,
         callbacks=callbacks,
-        plugins=[AtomicCheckpointIO()],
+        plugins=[AtomicCheckpointIO(), *_cluster()],
     )
     if is_rank_zero:
         _describe(folder, config, overrides, checkpoint is not None)
         print(f"run folder: {folder}", flush=True)
     with _plain_interrupt(), _named_range_errors(trainer):
         trainer.fit(module, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
+
+
+def _cluster() -> list[SLURMEnvironment]:
+    """Return how Lightning finds the processes of a SLURM job; its own checkpoints before a requeue are not ours."""
+    return [SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else []
 
 
 def _build_system(config: dict[str, Any]) -> AbstractSystem:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from data_gen.importers.ros_bag import recordings
+from data_gen.importers.ros_file import Bag
 from data_gen.importers.ros_images import depth_image
 from data_gen.importers.ros_transforms import TransformTree
 from data_gen.importers.settings import ImportSettings
@@ -102,6 +103,14 @@ def test_unaligned_depth_is_refused(tmp_path, pictures):
         bag.info(DEPTH_INFO, STAMPS[0], OPTICAL, focal=FOCAL * 0.7)
     with pytest.raises(DataError, match="another calibration than"):
         list(recordings(bag.path, ImportSettings()))
+
+
+def test_an_index_that_counts_messages_that_are_not_there_is_named(tmp_path, pictures, monkeypatch):
+    path = make_bag(tmp_path, pictures)
+    monkeypatch.setattr(Bag, "scan", lambda bag, topics, start=None: iter(()))
+
+    with pytest.raises(DataError, match="its index counts messages on .*, and there are none"):
+        list(recordings(path, ImportSettings()))
 
 
 def test_a_bag_without_depth_lists_what_it_has(tmp_path, pictures):

@@ -1,18 +1,20 @@
-"""Ctrl-C and SIGTERM: finish the step, save, leave with the exit code that shells expect (130 and 143)."""
+"""Ctrl-C, SIGTERM, SIGUSR1: finish the step, save, leave with the exit code that shells expect (130, 143, 138)."""
 
 import os
 import signal
+import subprocess
 import threading
 from types import FrameType
 from typing import Any
 
 import lightning.pytorch as pl
+import torch
 from lightning.pytorch.callbacks import Checkpoint
 
 from vpd_lightning.training.callbacks.keep_checkpoints import save_checkpoint
 from vpd_lightning.training.checkpoint_io import LAST
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 
 class StopOnSignal(Checkpoint):
@@ -20,6 +22,9 @@ class StopOnSignal(Checkpoint):
 
     A validation at hand is finished first, so that its row in ``metrics.csv`` is not lost; the weights are saved at
     once. The second signal ends the process without further ado; the checkpoint before it stays whole.
+
+    SIGUSR1 is what a cluster sends shortly before a job's time is up (``sbatch --signal=USR1@60``). In a SLURM job it
+    also puts the job back into the queue, where ``resume=auto`` goes on.
 
     A kind of ``Checkpoint`` because Lightning calls those after all others, in the order of the configuration.
     """
@@ -31,7 +36,7 @@ class StopOnSignal(Checkpoint):
         self._before: dict[int, Any] = {}
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Take over from Lightning, whose handler ends with other exit codes and without a checkpoint."""
+        """Take over from Lightning, whose handlers end with other exit codes and checkpoints."""
         self._received, self._is_saved = 0, False
         if threading.current_thread() is threading.main_thread():
             self._before = {number: signal.signal(number, self._handle) for number in _SIGNALS}
@@ -67,10 +72,13 @@ class StopOnSignal(Checkpoint):
 
     def _save_and_stop(self, trainer: pl.Trainer) -> None:
         save_checkpoint(trainer, LAST)
-        number = self._received or signal.SIGTERM
+        received = torch.tensor(self._received, device=trainer.strategy.root_device)
+        number = int(trainer.strategy.reduce(received, reduce_op="max"))  # not every rank was told
         if trainer.is_global_zero:
             name = signal.Signals(number).name
-            print(f"Stopped by {name} after step {trainer.global_step}; last.ckpt is saved. Go on with resume=last.")
+            is_queued = number == signal.SIGUSR1 and _requeue()
+            onward = "The job is back in the queue." if is_queued else "Go on with resume=last."
+            print(f"Stopped by {name} after step {trainer.global_step}; last.ckpt is saved. {onward}", flush=True)
         raise SystemExit(128 + number)
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
@@ -82,3 +90,20 @@ class StopOnSignal(Checkpoint):
 
 def _is_training(trainer: pl.Trainer) -> bool:
     return trainer.state.fn == "fit" and not trainer.sanity_checking
+
+
+def _requeue() -> bool:
+    """Put the SLURM job that this process belongs to back into the queue; False where there is none, or it fails."""
+    job = os.environ.get("SLURM_ARRAY_JOB_ID", os.environ.get("SLURM_JOB_ID"))
+    if job is None:
+        return False
+    if task := os.environ.get("SLURM_ARRAY_TASK_ID"):
+        job = f"{job}_{task}"
+    try:
+        done = subprocess.run(["scontrol", "requeue", job], capture_output=True, text=True, timeout=20, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        print(f"SLURM job {job} could not be put back into the queue: {error}", flush=True)
+        return False
+    if done.returncode:
+        print(f"SLURM job {job} could not be put back into the queue: {done.stderr.strip()}", flush=True)
+    return done.returncode == 0
