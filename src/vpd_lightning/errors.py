@@ -39,6 +39,12 @@ class OutOfMemoryError(VPDError):
     exit_code = 5
 
 
+class LostProcessError(VPDError):
+    """Another process of a training on several devices is gone."""
+
+    exit_code = 6
+
+
 class NonFiniteError(VPDError):
     """A loss or gradient became NaN or infinite; raised before the optimiser could use it."""
 

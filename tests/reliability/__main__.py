@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.reliability import checkpoints, fuzz, kills
+from tests.reliability import checkpoints, fuzz, kills, ranks
 from tests.reliability.outcome import Outcome, write
 
 CHECKS: dict[str, Callable[[Path], list[Outcome]]] = {
@@ -16,6 +16,7 @@ CHECKS: dict[str, Callable[[Path], list[Outcome]]] = {
     "checkpoints": checkpoints.checkpoints,
     "reader": fuzz.reader,
     "importers": fuzz.importers,
+    "ranks": ranks.ranks,
 }
 
 

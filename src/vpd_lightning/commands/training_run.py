@@ -22,7 +22,7 @@ from vpd_lightning.commands.provide_data import provide_data
 from vpd_lightning.commands.resume import OVERRIDES_FILE, has_own_checkpoint, quote
 from vpd_lightning.commands.run_claim import claimed
 from vpd_lightning.config import build, build_list, build_simulator, compose
-from vpd_lightning.errors import ConfigError, OutOfMemoryError
+from vpd_lightning.errors import ConfigError, LostProcessError, OutOfMemoryError
 from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.randomness import derive_seed
 from vpd_lightning.system import AbstractSystem
@@ -106,7 +106,7 @@ def fit(
     if is_rank_zero:
         _describe(folder, config, overrides, checkpoint is not None)
         print(f"run folder: {folder}", flush=True)
-    with _plain_interrupt(), _named_range_errors(trainer):
+    with _plain_interrupt(), _named_range_errors(trainer), _named_lost_process(trainer):
         trainer.fit(module, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
 
 
@@ -216,6 +216,23 @@ def _named_range_errors(trainer: Trainer) -> Iterator[None]:
         if trainer.global_step > 0 or not is_ours:
             raise
         raise ConfigError(f"the training cannot start.\n{error}") from error
+
+
+@contextmanager
+def _named_lost_process(trainer: Trainer) -> Iterator[None]:
+    """Say in plain words that another process is gone; what the transport said goes to the log."""
+    try:
+        yield
+    except RuntimeError as error:
+        lost = isinstance(error, torch.distributed.DistError) or "gloo" in str(error)
+        if trainer.world_size == 1 or not lost:
+            raise
+        log.info("the transport between processes failed", exc_info=error)
+        raise LostProcessError(
+            f"another of the {trainer.world_size} processes of this training is gone (seen by rank"
+            f" {trainer.global_rank} at step {trainer.global_step}).\n"
+            "It was killed, or ran out of memory: its own output says why. Go on with resume=last."
+        ) from error
 
 
 @contextmanager
