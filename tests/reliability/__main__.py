@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.reliability import checkpoints, fuzz, kills, ranks
+from tests.reliability import checkpoints, fuzz, kills, memory, ranks, slurm
 from tests.reliability.outcome import Outcome, write
 
 CHECKS: dict[str, Callable[[Path], list[Outcome]]] = {
@@ -17,6 +17,8 @@ CHECKS: dict[str, Callable[[Path], list[Outcome]]] = {
     "reader": fuzz.reader,
     "importers": fuzz.importers,
     "ranks": ranks.ranks,
+    "slurm": slurm.slurm,
+    "memory": memory.memory,
 }
 
 

@@ -1,6 +1,6 @@
 """A tiny training in float64 by several processes, which writes down what each rank was given and what it learned.
 
-``python -m tests.reliability.ranks_child DATA RUN DEVICES BATCH STEPS``: the clips of each step in ``clips_RANK.json``, the
+``python -m tests.reliability.ranks_child DATA RUN DEVICES BATCH STEPS``: each step's clips in ``clips_RANK.json``, the
 gradients of the second step, after they were averaged, in ``gradients.pt``. A run with a checkpoint is gone on with.
 """
 

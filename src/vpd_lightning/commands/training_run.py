@@ -112,7 +112,12 @@ def fit(
 
 def _cluster() -> list[SLURMEnvironment]:
     """Return how Lightning finds the processes of a SLURM job; its own checkpoints before a requeue are not ours."""
-    return [SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else []
+    if not SLURMEnvironment.detect():
+        return []
+    try:
+        return [SLURMEnvironment(auto_requeue=False)]
+    except RuntimeError as error:
+        raise ConfigError(f"the SLURM job does not fit a training.\n{error}") from error
 
 
 def _build_system(config: dict[str, Any]) -> AbstractSystem:
