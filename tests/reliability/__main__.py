@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.reliability import checkpoints, fuzz, kills, memory, ranks, slurm
+from tests.reliability import checkpoints, disks, fuzz, kills, memory, offline, ranks, slurm
 from tests.reliability.outcome import Outcome, write
 
 CHECKS: dict[str, Callable[[Path], list[Outcome]]] = {
@@ -18,6 +18,8 @@ CHECKS: dict[str, Callable[[Path], list[Outcome]]] = {
     "importers": fuzz.importers,
     "ranks": ranks.ranks,
     "slurm": slurm.slurm,
+    "disks": disks.disks,
+    "offline": offline.offline,
     "memory": memory.memory,
 }
 

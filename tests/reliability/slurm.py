@@ -1,4 +1,4 @@
-"""A real SLURM, of one machine: a job of four tasks is told that its time is up, goes back to the queue, and goes on."""
+"""A real SLURM, of one machine: a job of four tasks hears that its time is up, is queued again, and goes on."""
 
 import os
 import re

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.reliability import checkpoints, fuzz, kills
+from tests.reliability import checkpoints, disks, fuzz, kills
 from tests.reliability.outcome import Outcome, read, write
 from tests.reliability.trainings import differences, kill_group, members, run, start
 
@@ -36,6 +36,12 @@ def test_mutated_files_are_read_or_refused(tmp_path: Path) -> None:
     pytest.importorskip("av")
     assert_kept(fuzz.reader(tmp_path, count=200))
     assert_kept(fuzz.importers(tmp_path, count=40))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not disks.is_possible(), reason="no mount namespaces here")
+def test_a_disk_that_fails_is_named(tmp_path: Path) -> None:
+    assert_kept(disks.disks(tmp_path))
 
 
 def test_processes_of_a_group_are_found_and_ended(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import IO
@@ -35,7 +35,8 @@ def claimed(folder: Path, *, is_new: bool) -> Iterator[None]:
         try:
             yield
         finally:
-            path.unlink(missing_ok=True)
+            with suppress(OSError):  # the disk may be what ended the run
+                path.unlink(missing_ok=True)
 
 
 def _locked_file(path: Path, *, is_new: bool) -> IO[str]:

@@ -3,8 +3,6 @@
 import json
 import logging
 import shutil
-import signal
-import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -21,8 +19,15 @@ from vpd_lightning.commands.first_training import FirstTraining, hand_over, trai
 from vpd_lightning.commands.provide_data import provide_data
 from vpd_lightning.commands.resume import OVERRIDES_FILE, has_own_checkpoint, quote
 from vpd_lightning.commands.run_claim import claimed
+from vpd_lightning.commands.training_errors import (
+    named_disk_errors,
+    named_lost_process,
+    named_memory_errors,
+    named_range_errors,
+    plain_interrupt,
+)
 from vpd_lightning.config import build, build_list, build_simulator, compose
-from vpd_lightning.errors import ConfigError, LostProcessError, OutOfMemoryError
+from vpd_lightning.errors import ConfigError
 from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.randomness import derive_seed
 from vpd_lightning.system import AbstractSystem
@@ -47,7 +52,7 @@ def train_in(folder: Path, config: dict[str, Any], overrides: Sequence[str], *, 
     is_new = is_rank_zero and not config["resume"]
     with claimed(folder, is_new=is_new) if is_rank_zero else nullcontext():
         try:
-            with _named_memory_errors(), _libraries_in_log():
+            with named_memory_errors(), named_disk_errors(folder), _libraries_in_log():
                 _set_numerics(config)
                 if is_new and config["pretraining"]:  # the first training may end before fit() describes the second
                     _describe(folder, config, overrides, is_resumed=False)
@@ -106,7 +111,7 @@ def fit(
     if is_rank_zero:
         _describe(folder, config, overrides, checkpoint is not None)
         print(f"run folder: {folder}", flush=True)
-    with _plain_interrupt(), _named_range_errors(trainer), _named_lost_process(trainer):
+    with plain_interrupt(), named_range_errors(trainer), named_lost_process(trainer):
         trainer.fit(module, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
 
 
@@ -192,62 +197,3 @@ def _libraries_in_log() -> Iterator[None]:
         logging.captureWarnings(False)
         for logger, (handlers, propagate) in zip(loggers, before, strict=True):
             logger.handlers, logger.propagate = handlers, propagate
-
-
-@contextmanager
-def _named_memory_errors() -> Iterator[None]:
-    """Say which knobs to turn where memory ran out."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        text = str(error).lower()
-        if isinstance(error, MemoryError | torch.OutOfMemoryError) or "out of memory" in text or "alloc_cpu" in text:
-            raise OutOfMemoryError(
-                "memory ran out.\n"
-                "Lower renderer.ray_chunk_size (same result), data.batch_size, data.rays_per_step, data.num_steps or\n"
-                "encoder.num_particles; or use more devices: each takes its share of data.batch_size."
-            ) from error
-        raise
-
-
-@contextmanager
-def _named_range_errors(trainer: Trainer) -> Iterator[None]:
-    """Before the first step, a value that our code refuses is a fault of the configuration, not of the program."""
-    try:
-        yield
-    except ValueError as error:
-        frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-        is_ours = frames[-1].f_globals.get("__name__", "").startswith("vpd_lightning.")
-        if trainer.global_step > 0 or not is_ours:
-            raise
-        raise ConfigError(f"the training cannot start.\n{error}") from error
-
-
-@contextmanager
-def _named_lost_process(trainer: Trainer) -> Iterator[None]:
-    """Say in plain words that another process is gone; what the transport said goes to the log."""
-    try:
-        yield
-    except RuntimeError as error:
-        lost = isinstance(error, torch.distributed.DistError) or "gloo" in str(error)
-        if trainer.world_size == 1 or not lost:
-            raise
-        log.info("the transport between processes failed", exc_info=error)
-        raise LostProcessError(
-            f"another of the {trainer.world_size} processes of this training is gone (seen by rank"
-            f" {trainer.global_rank} at step {trainer.global_step}).\n"
-            "It was killed, or ran out of memory: its own output says why. Go on with resume=last."
-        ) from error
-
-
-@contextmanager
-def _plain_interrupt() -> Iterator[None]:
-    """Turn Lightning's answer to Ctrl-C, an exit with code 1, back into the interrupt it was."""
-    handler = signal.getsignal(signal.SIGINT)
-    try:
-        yield
-    except SystemExit as stop:
-        if stop.code == 1 and isinstance(stop.__context__, KeyboardInterrupt):
-            signal.signal(signal.SIGINT, handler)
-            raise KeyboardInterrupt from stop
-        raise
