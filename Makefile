@@ -19,7 +19,7 @@ STAMP := $(VENV)/.installed
 
 export MPLBACKEND = Agg
 
-.PHONY: help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
+.PHONY: audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
 	types imports cluster bench stability paper-step wheel clean
 
 help: ## List the targets
@@ -100,6 +100,14 @@ empty :=
 
 stability: $(STAMP) ## Run the numerical stability matrix; the last line counts its cases
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/stability -n $(WORKERS) --dist loadfile -q
+
+reliability: $(STAMP) ## Kill, damage, mutate, requeue: every promise of docs/reliability.md, in under 40 minutes; writes its table
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.reliability
+	$(BIN)/python -m tests.reliability.page
+
+audit: ## Ask pip-audit about the locked versions; fails where it cannot tell (needs an index that has advisories)
+	test -x .venv-audit/bin/pip-audit || { $(PYTHON) -m venv .venv-audit && .venv-audit/bin/python -m pip install pip-audit; }
+	.venv-audit/bin/pip-audit --strict --no-deps --disable-pip -r constraints.txt
 
 bench: $(STAMP) ## Measure all suites on the CPU, one thread, in under 15 minutes; writes benchmarks/results and its page
 	OMP_NUM_THREADS=1 $(BIN)/vpd-bench suite=all device=cpu "ckpt=[$(subst $(empty) $(empty),$(comma),$(strip $(BENCH_MODELS)))]"

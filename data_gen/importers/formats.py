@@ -51,8 +51,10 @@ def open_format(path: Path, wanted: str) -> tuple[str, ImportFormat]:
         return wanted, _module(wanted)
     found = [name for name in FORMATS if _module(name).matches(path)]
     if not found:
-        looks = "\n".join(f"  {name:<12}{look}" for name, (_, look) in FORMATS.items())
-        raise DataError(f"{path} is none of the formats that can be imported:\n{looks}\ndocs/your_data.md says more.")
+        raise DataError(
+            f"{path} is none of the formats that can be imported: {', '.join(FORMATS)}.\n"
+            "docs/your_data.md shows what each looks like; the simplest is plain, a folder with cameras.json."
+        )
     if len(found) > 1:
         raise ConfigError(f"{path} looks like {' and '.join(found)}. Say which: format={found[0]}")
     return found[0], _module(found[0])

@@ -32,7 +32,7 @@ def offline(work: Path) -> list[Outcome]:
             "generate",
             "scene=mujoco_block",
             "preset=tiny",
-            f"out={data}",
+            f"out={out}",
             "seed=0",
         ],
         "vpd-data validate": [*_module("data"), "validate", str(out)],

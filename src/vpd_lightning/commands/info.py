@@ -36,6 +36,7 @@ _EXTRAS = {
     "wandb": ("logger=wandb", "pip install wandb"),
     "rosbags": ("importing ROS bags", "pip install 'vpd-lightning[ros]'"),
     "pyarrow": ("importing LeRobot data sets", "pip install 'vpd-lightning[lerobot]'"),
+    "hydra-submitit-launcher": ("many runs on a cluster", "pip install 'vpd-lightning[slurm]'"),
     "av": ("importing LeRobot videos", "pip install 'vpd-lightning[lerobot]'"),
 }
 RELEASED = "released"

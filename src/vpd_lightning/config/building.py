@@ -311,5 +311,9 @@ def _explain_failure(error: InstantiationException, name: str) -> VPDError:
         return ConfigError(f"{name} needs the package {cause.name}, which is not installed.\npip install {cause.name}")
     if isinstance(cause, ImportError | ValueError | TypeError):
         return ConfigError(f"{name} cannot be built.\n{cause}")
+    if "No supported gpu backend found" in str(cause):  # Lightning's words
+        return ConfigError(
+            "there is no GPU here that PyTorch can use (vpd-info lists what there is).\nUse trainer=cpu."
+        )
     first = str(cause or error).splitlines()[0] if str(cause or error) else type(cause).__name__
     return ConfigError(f"{name} cannot be built.\n{type(cause or error).__name__}: {first}")

@@ -101,6 +101,10 @@ def _explain_missing_option(text: str, overrides: Sequence[str]) -> ConfigError:
     if not options:
         names = [word.partition("=")[0] for word in overrides]
         return ConfigError(f"there is no configuration {wanted[1]}.\nGiven: {' '.join(names) or 'nothing'}.")
+    if group == "hydra/launcher" and option.startswith("submitit"):
+        return ConfigError(
+            f"hydra/launcher={option} is not installed.\npip install 'vpd-lightning[slurm]'; see docs/clusters.md."
+        )
     what = "experiment" if group == "experiment" else f"option of {group}"
     listing = f"There are: {', '.join(options)}."
     return ConfigError(f"there is no {what} called {option}.\n{guess or 'Check the name.'}\n{listing}")

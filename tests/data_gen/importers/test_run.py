@@ -317,7 +317,9 @@ def test_many_remarks_are_cut_short(source: Path, tmp_path: Path, capsys: pytest
 
 
 def test_unknown_sources_list_the_formats(tmp_path: Path):
-    with pytest.raises(DataError, match="(?s)none of the formats.*cameras.json.*meta/info.json"):
+    with pytest.raises(
+        DataError, match=r"(?s)none of the formats that can be imported: plain, .*lerobot\.\ndocs/your_data.md"
+    ):
         open_format(tmp_path, "auto")
     with pytest.raises(DataError, match="There is no"):
         open_format(tmp_path / "nothing", "auto")

@@ -1,0 +1,179 @@
+"""What is said to the commonest mistakes, word for word: docs/errors.md holds it, for people and as a snapshot.
+
+After a change of a message: ``VPD_WRITE_ERRORS=1 pytest tests/commands/test_common_mistakes.py``; read the diff.
+"""
+
+import os
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.data.recordings import write_recordings
+from vpd_lightning.commands import data, eval, export, info, render, report, run_claim, train
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "errors.md"
+HEAD = """# Common mistakes, and what is said
+
+Every message says what is wrong and what to do, in at most five lines; `debug=true` adds the traceback. This page is
+written by `tests/commands/test_common_mistakes.py`, which makes each mistake.
+"""
+MAINS = {
+    "vpd-train": train.main, "vpd-eval": eval.main, "vpd-render": render.main, "vpd-data": data.main,
+    "vpd-export": export.main, "vpd-report": report.main, "vpd-info": info.main,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """What went wrong, the command as one would type it, its exit code, and what else is done before and told."""
+
+    title: str
+    command: str
+    code: int
+    hidden: str = ""  # words that only make the test quick
+    before: Callable[[pytest.MonkeyPatch], object] = field(default=lambda patch: None)
+
+
+def _occupied(patch: pytest.MonkeyPatch) -> None:
+    Path("runs/mine").mkdir(parents=True)
+    (Path("runs/mine") / run_claim.CLAIM).touch()
+    patch.setattr(run_claim, "is_claimed", lambda folder: True)
+
+
+def _out_of_memory(patch: pytest.MonkeyPatch) -> None:
+    def fail(*arguments: object, **options: object) -> None:
+        raise MemoryError
+
+    patch.setattr("vpd_lightning.simulator.Simulator.forward", fail)
+
+
+def _no_gl(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("data_gen.gl_backend.why_not", lambda backend: "its library is missing")
+
+
+def _cut_data(patch: pytest.MonkeyPatch) -> None:
+    shutil.copytree("datasets/tiny", "datasets/cut")
+    for path in Path("datasets/cut/train").glob("*.h5"):
+        path.write_bytes(path.read_bytes()[:1000])
+
+
+def _damaged(patch: pytest.MonkeyPatch) -> None:
+    content = Path("runs/trained/checkpoints/last.ckpt").read_bytes()
+    Path("damaged.ckpt").write_bytes(content[:-5000] + bytes(100) + content[-4900:])
+    Path("cut.ckpt").write_bytes(content[:5000])
+
+
+def _lightning_checkpoint(patch: pytest.MonkeyPatch) -> None:
+    torch.save({"state_dict": {}, "pytorch-lightning_version": "1.0"}, "other.ckpt")
+
+
+QUICK = "QUICK"
+MISTAKES = [
+    Mistake("A key that is spelt wrong", "vpd-train experiment=tiny encoder.num_particle=64", 2),
+    Mistake("A key in another section", "vpd-train experiment=tiny trainer.batch_size=4", 2),
+    Mistake("A word where a number belongs", "vpd-train experiment=tiny seed=abc", 2),
+    Mistake("An experiment that does not exist", "vpd-train experiment=tinny", 2),
+    Mistake("A stage that does not exist", "vpd-train experiment=tiny renderer=nerf", 2),
+    Mistake("A flag that does not exist", "vpd-train --fast experiment=tiny", 2),
+    Mistake("Several values without -m", "vpd-train experiment=tiny seed=1,2", 2),
+    Mistake("Stages that do not fit together", "vpd-train experiment=tiny dynamics.feature_dim=8", 2),
+    Mistake("A class from elsewhere", "vpd-train experiment=tiny encoder._target_=os.system", 2),
+    Mistake("A GPU where there is none", "vpd-train experiment=tiny trainer=gpu", 2, QUICK + " trainer=gpu"),
+    Mistake("A sweep over runs with several devices", "vpd-train -m experiment=tiny seed=1,2 trainer.devices=2", 2),
+    Mistake("A launcher that is not installed", "vpd-train -m hydra/launcher=submitit_slurm seed=1,2", 2),
+    Mistake("Data that were not generated yet", "vpd-train experiment=mujoco_block trainer=cpu", 3),
+    Mistake("A data folder that is not there", "vpd-train data.folder=mine trainer=cpu", 3),
+    Mistake("A data file that was cut short", "vpd-train data.folder=datasets/cut", 3, QUICK, _cut_data),
+    Mistake("A camera that is not there", "vpd-train experiment=tiny scene.input_views=[0,7]", 3, QUICK),
+    Mistake("Clips longer than the recordings", "vpd-train experiment=tiny data.num_steps=40", 3, QUICK),
+    Mistake(
+        "A workspace without a point",
+        "vpd-train experiment=tiny scene.workspace_min=[50,50,50] scene.workspace_max=[51,51,51]", 3, QUICK,
+    ),
+    Mistake("Memory that runs out", "vpd-train experiment=tiny", 5, QUICK, _out_of_memory),
+    Mistake("A run folder that exists", "vpd-train experiment=tiny run.folder=runs/trained", 2, QUICK),
+    Mistake("A run folder that another run has taken", "vpd-train run.folder=runs/mine", 2, QUICK, _occupied),
+    Mistake("Nothing to resume", "vpd-train resume=last", 4),
+    Mistake("resume=auto without a folder", "vpd-train experiment=tiny resume=auto", 2),
+    Mistake("No checkpoint given", "vpd-eval", 2),
+    Mistake("A checkpoint that is not there", "vpd-eval ckpt=nowhere.ckpt", 4),
+    Mistake("A checkpoint that was cut short", "vpd-eval ckpt=cut.ckpt", 4, "", _damaged),
+    Mistake("A checkpoint that is damaged", "vpd-eval ckpt=damaged.ckpt", 4, "", _damaged),
+    Mistake("A checkpoint of another program", "vpd-eval ckpt=other.ckpt", 4, "", _lightning_checkpoint),
+    Mistake("A split that does not exist", "vpd-eval ckpt=runs/trained protocol.split=testing", 2),
+    Mistake("More steps than were recorded", "vpd-eval ckpt=runs/trained protocol.num_steps=50", 3),
+    Mistake("A device that is not there", "vpd-eval ckpt=runs/trained device=cuda:77", 2),
+    Mistake("A film into a folder that is there", "vpd-render ckpt=runs/trained out=runs", 2),
+    Mistake("No GL", "vpd-data generate scene=mujoco_block preset=tiny out=made renderer=auto", 3, "", _no_gl),
+    Mistake("A preset that does not exist", "vpd-data generate scene=mujoco_block preset=tinny out=made", 2),
+    Mistake("A recording of no known kind", "vpd-data import runs out=made", 3),
+    Mistake("A model that was not evaluated", "vpd-export ckpt=runs/trained out=released/mine", 2),
+    Mistake("A report about nothing", "vpd-report runs", 3),
+    Mistake("An option that vpd-info does not have", "vpd-info --jsn", 2),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory, dataset: Path, trained: Path) -> Path:
+    folder = tmp_path_factory.mktemp("mistakes")
+    shutil.copytree(dataset, folder / "datasets" / "tiny")
+    shutil.copytree(trained, folder / "runs" / "trained")
+    write_recordings(folder / "datasets" / "recordings")
+    return folder
+
+
+def said(
+    mistake: Mistake, place: Path, quick: list[str], patch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> str:
+    """Make the mistake and return what stderr says, without the places of this machine."""
+    patch.chdir(place)
+    mistake.before(patch)
+    name, *words = mistake.command.split()
+    hidden = mistake.hidden.split()
+    if hidden[:1] == [QUICK]:
+        given = {word.split("=")[0] for word in words}
+        words = [*[word for word in quick if word.split("=")[0] not in given], *words, *hidden[1:]]
+    code = MAINS[name](words)
+    message = capsys.readouterr().err.strip()
+    assert code == mistake.code, message
+    for path, label in ((str(place), "."), (str(Path.home()), "~")):
+        message = message.replace(path, label)
+    message = re.sub(r"(no device '[^']*'): .*", r"\1: ...", message)  # the reason is PyTorch's, of its build
+    return re.sub(r"/\S*?/pytest-\d+/[\w-]+/", "", message)
+
+
+def section(mistake: Mistake, message: str) -> str:
+    return f"\n## {mistake.title}\n\n```\n$ {mistake.command}\n{message}\n```\n"
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.title)
+def test_the_message_is_the_one_of_the_page(
+    mistake: Mistake,
+    place: Path,
+    quick: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if "trainer=gpu" in mistake.command and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    if "submitit" in mistake.command and find_spec("submitit"):
+        pytest.skip("the launcher is installed")
+    message = said(mistake, place, quick, monkeypatch, capsys)
+
+    assert message.startswith("error: ") and len(message.splitlines()) <= 5
+    if os.environ.get("VPD_WRITE_ERRORS"):
+        begin = HEAD if mistake is MISTAKES[0] else PAGE.read_text()
+        PAGE.write_text(begin + section(mistake, message))
+    assert section(mistake, message) in PAGE.read_text()
+
+
+def test_the_page_holds_every_mistake_and_no_other() -> None:
+    titles = re.findall(r"^## (.*)$", PAGE.read_text(), re.M)
+    assert titles == [mistake.title for mistake in MISTAKES]
+    assert len(titles) >= 30
