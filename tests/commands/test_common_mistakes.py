@@ -8,7 +8,6 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -86,7 +85,6 @@ MISTAKES = [
     Mistake("A class from elsewhere", "vpd-train experiment=tiny encoder._target_=os.system", 2),
     Mistake("A GPU where there is none", "vpd-train experiment=tiny trainer=gpu", 2, QUICK + " trainer=gpu"),
     Mistake("A sweep over runs with several devices", "vpd-train -m experiment=tiny seed=1,2 trainer.devices=2", 2),
-    Mistake("A launcher that is not installed", "vpd-train -m hydra/launcher=submitit_slurm seed=1,2", 2),
     Mistake("Data that were not generated yet", "vpd-train experiment=mujoco_block trainer=cpu", 3),
     Mistake("A data folder that is not there", "vpd-train data.folder=mine trainer=cpu", 3),
     Mistake("A data file that was cut short", "vpd-train data.folder=datasets/cut", 3, QUICK, _cut_data),
@@ -162,8 +160,6 @@ def test_the_message_is_the_one_of_the_page(
 ) -> None:
     if "trainer=gpu" in mistake.command and torch.cuda.is_available():
         pytest.skip("there is a GPU")
-    if "submitit" in mistake.command and find_spec("submitit"):
-        pytest.skip("the launcher is installed")
     message = said(mistake, place, quick, monkeypatch, capsys)
 
     assert message.startswith("error: ") and len(message.splitlines()) <= 5

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from tests.reliability.outcome import Outcome
-from tests.reliability.trainings import environment, make_data, metrics, words
+from tests.reliability.trainings import environment, make_data, metrics, start, words
 from vpd_lightning.training.checkpoint_io import load_checkpoint
 
 CLUSTER = Path(__file__).with_name("one_machine_slurm.sh")
@@ -40,6 +40,7 @@ def slurm(work: Path, *, log: Path | None = LOG) -> list[Outcome]:
         step = load_checkpoint(disturbed / "checkpoints" / "last.ckpt")["global_step"]
         _wait(job, settings)
         restarts = _shown(job, "Restarts", settings)
+        many = _multirun(data, work, settings)
         steps = [int(number) for number in re.findall(r"^step (\d+)", _text(output), re.M)]
     finally:
         _call(str(CLUSTER), "stop", str(place))
@@ -55,7 +56,22 @@ def slurm(work: Path, *, log: Path | None = LOG) -> list[Outcome]:
     return [
         Outcome("a SLURM job of four tasks saved and requeued itself on SIGUSR1", 1, int(went_on), f"{seconds:.1f} s"),
         Outcome("the requeued job went on from the same bits and ended as an undisturbed one", 1, int(held), seen),
+        many,
     ]
+
+
+def _multirun(data: Path, work: Path, settings: dict[str, str]) -> Outcome:
+    """Send one job for each of two seeds through submitit."""
+    place = work / "slurm_multirun"
+    place.mkdir()
+    training = [word for word in words(data, place, 6) if not word.startswith("run.folder=")]
+    launcher = ["-m", "hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=10", "seed=0,1"]
+    process = start([*launcher, *training], cwd=place, env=settings)
+    output, _ = process.communicate(timeout=600)
+    ended = len(list(place.glob("runs/*/*/checkpoints/last.ckpt")))
+    if process.returncode != 0:
+        print(output[-2000:])
+    return Outcome("runs of a multirun became SLURM jobs and ended", 2, ended if process.returncode == 0 else 0)
 
 
 def _distance(a: Path, b: Path) -> float:

@@ -72,12 +72,15 @@ def _train_as_told(arguments: Arguments) -> int:
         _make_room(configs[0])
 
     failures: list[Exception] = []
+    starter = os.getpid()
 
     def job(config: Any) -> None:
         """One run; errors are kept, so that Hydra prints nothing of its own and a sweep goes on."""
         try:
             _run_job(config)
         except Exception as error:
+            if os.getpid() != starter:  # a launcher took the job elsewhere and brings its error back
+                raise
             failures.append(error)
             if arguments.is_multirun:
                 _show(error)
