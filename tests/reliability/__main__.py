@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.reliability import checkpoints, disks, fuzz, kills, memory, offline, ranks, slurm
+from tests.reliability import checkpoints, determinism, disks, fuzz, kills, memory, offline, ranks, slurm
 from tests.reliability.outcome import Outcome, write
 
 CHECKS: dict[str, Callable[[Path], list[Outcome]]] = {
     "kills": kills.kills,
     "signals": kills.signals,
+    "determinism": determinism.determinism,
     "checkpoints": checkpoints.checkpoints,
     "reader": fuzz.reader,
     "importers": fuzz.importers,

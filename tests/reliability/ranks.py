@@ -24,7 +24,7 @@ def ranks(work: Path, *, world: int = WORLD) -> list[Outcome]:
     one, many = work / "one_rank", work / "many_ranks"
     _train(data, one, 1, world, 3)
     _train(data, many, world, world, 3)
-    return [_gradients(one, many, world), _clips(one, many, world), _resumed(data, work), *_killed(work)]
+    return [_gradients(one, many, world), _clips(one, many, world), _resumed(data, work), *_killed(work), _asked(work)]
 
 
 def _train(data: Path, run: Path, devices: int, batch: int, steps: int) -> None:
@@ -79,19 +79,43 @@ def _resumed(data: Path, work: Path) -> Outcome:
     )
 
 
+def _started(folder: Path, data: Path) -> tuple[subprocess.Popen[str], dict[str, int]]:
+    """Start a real ``vpd-train trainer=ddp_cpu`` and return it, five steps later, with its two processes."""
+    process = start(words(data, folder, 100_000, "trainer=ddp_cpu"))
+    for line in process.stdout or ():
+        if line.startswith("step 5"):
+            break
+    (second,) = [item for item in members(process.pid) if item != process.pid and _is_training(item)]
+    return process, {"the first": process.pid, "the second": second}
+
+
+def _asked(work: Path) -> Outcome:
+    """Ask one of two processes to stop; both must, together, with a checkpoint."""
+    data = make_data(work / "data")
+    held, seen = 0, []
+    for asked in ("the first", "the second"):
+        folder = work / f"asked_{asked.replace(' ', '_')}"
+        process, ranks = _started(folder, data)
+        os.kill(ranks[asked], signal.SIGTERM)
+        output, _ = process.communicate(timeout=60)
+        step = load_checkpoint(folder / "checkpoints" / "last.ckpt")["global_step"]
+        is_told = f"Stopped by SIGTERM after step {step}" in output
+        held += process.returncode == 128 + signal.SIGTERM and is_told and not members(process.pid)
+        seen.append(f"{asked}: exit code {process.returncode}, step {step}")
+        if os.environ.get("VPD_RANKS_VERBOSE"):
+            print(output[-3000:])
+    return Outcome("when one of two processes was asked to stop, both saved and stopped", 2, held, "; ".join(seen))
+
+
 def _killed(work: Path) -> list[Outcome]:
-    """Kill one of two processes of a real ``vpd-train trainer=ddp_cpu``: the other, and then the first."""
+    """Kill one of two processes: the second, and then the first."""
     data = make_data(work / "data")
     outcomes = []
     for victim in ("the second", "the first"):
         folder = work / f"killed_{victim.replace(' ', '_')}"
-        process = start(words(data, folder, 100_000, "trainer=ddp_cpu"))
-        for line in process.stdout or ():
-            if line.startswith("step 5"):
-                break
-        others = [item for item in members(process.pid) if item != process.pid and _is_training(item)]
+        process, ranks = _started(folder, data)
         began = time.monotonic()
-        os.kill(process.pid if victim == "the first" else others[0], signal.SIGKILL)
+        os.kill(ranks[victim], signal.SIGKILL)
         while members(process.pid) and time.monotonic() - began < 120:
             time.sleep(0.2)
         seconds = time.monotonic() - began
