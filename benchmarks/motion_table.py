@@ -2,7 +2,9 @@
 
 ``FOLDER`` holds ``EXPERIMENT/SYSTEM_SEED/evaluation/metrics.json``, as ``vpd-train`` with that ``run.folder`` and then
 ``vpd-eval`` leave them. Each cell is the mean over seeds with the least and the greatest. References are those of the
-first seed; they are the same for all.
+first seed; they are the same for all. Centroid errors (``step N``) and Chamfer distance are in centimetres; ``size 32``
+is a rigid body's size after 32 steps over its first, ``rest`` the share of bodies that come to rest within 5 cm of
+their true height.
 """
 
 import argparse
@@ -16,9 +18,14 @@ import numpy as np
 
 Metrics = dict[str, Any]
 STEPS = (1, 4, 8, 16, 32)
+MIN_AT_REST = 5  # bodies, below which a share says nothing
 REFERENCES = {"copy_last": "*last frame*", "train_mean": "*mean image*"}
 CENTROIDS = {"constant": "*best constant*", "velocity": "*first velocity kept*"}
-HEADER = ["data set", "system", "updates", "PSNR", "PSNR moving", *(f"step {step}" for step in STEPS), "Chamfer"]
+HEADER = [
+    "data set", "system", "updates", "PSNR", "PSNR moving", *(f"step {step}" for step in STEPS),
+    "Chamfer", "size 32", "rest",
+]  # fmt: skip
+FORMS = {"updates": ".0f", "PSNR": ".2f", "PSNR moving": ".2f", "size 32": ".2f", "rest": ".0%"}
 
 
 def read_runs(folder: Path) -> dict[str, dict[str, dict[int, Metrics]]]:
@@ -45,7 +52,13 @@ def numbers_of(metrics: Metrics) -> dict[str, float | None]:
         "PSNR moving": metrics["psnr_moving"]["mean"],
         "Chamfer": 100 * metrics["chamfer"]["mean"],
     }
-    return shown | {f"step {step}": 100 * errors[step - 1] for step in STEPS}
+    sizes = metrics["motion"].get("size_ratio", {}).get("per_step")
+    rest = metrics.get("events", {}).get("rest", {})
+    shown |= {f"step {step}": 100 * errors[step - 1] for step in STEPS}
+    return shown | {
+        "size 32": sizes[31] if sizes else None,
+        "rest": rest.get("share_within_5_cm") if rest.get("count", 0) >= MIN_AT_REST else None,
+    }
 
 
 def references_of(metrics: Metrics) -> dict[str, dict[str, float | None]]:
@@ -79,7 +92,7 @@ def _spread(values: Sequence[float | None], name: str) -> str:
     known = [value for value in values if value is not None]
     if not known:
         return "-"
-    form = {"updates": ".0f", "PSNR": ".2f", "PSNR moving": ".2f"}.get(name, ".1f")
+    form = FORMS.get(name, ".1f")
     mean = format(float(np.mean(known)), form)
     return mean if len(known) == 1 else f"{mean} [{format(min(known), form)}, {format(max(known), form)}]"
 

@@ -2,18 +2,20 @@ import json
 
 import pytest
 
-from benchmarks.motion_table import main, read_runs, table
+from benchmarks.motion_table import main, numbers_of, read_runs, table
 
 
 def metrics(psnr, errors):
     reference = {"psnr": {"mean": 20.0}, "psnr_moving": {"mean": None}}
-    motion = {f"centroid_error{kind}": {"per_step": list(errors)} for kind in ("", "_constant", "_velocity")}
+    motion = {"size_ratio": {"per_step": [1.0] * 31 + [1.25]}}
+    motion |= {f"centroid_error{kind}": {"per_step": list(errors)} for kind in ("", "_constant", "_velocity")}
     return {
         "step": 100,
         "psnr": {"mean": psnr},
         "psnr_moving": {"mean": psnr - 5},
         "chamfer": {"mean": 0.031},
         "motion": motion,
+        "events": {"rest": {"share_within_5_cm": 0.75, "count": 20}},
         "references": {"copy_last": reference, "train_mean": reference},
     }
 
@@ -35,7 +37,17 @@ def test_a_cell_is_the_mean_over_seeds_with_its_range(runs):
         "| block | inertial_gnn | 100 [100, 100] | 23.00 [22.00, 24.00] | 18.00 [17.00, 19.00] | 1.5 [1.0, 2.0] |"
         in row
     )
-    assert row.endswith("| 3.1 [3.1, 3.1] |")
+    assert row.endswith("| 3.1 [3.1, 3.1] | 1.25 [1.25, 1.25] | 75% [75%, 75%] |")
+
+
+def test_what_was_not_measured_is_left_open():
+    found = metrics(22.0, range(32))
+    del found["motion"]["size_ratio"]
+    found["events"]["rest"]["count"] = 1
+
+    numbers = numbers_of(found)
+
+    assert numbers["size 32"] is None and numbers["rest"] is None
 
 
 def test_references_and_numbers_of_every_run_are_kept(runs, tmp_path, capsys):
