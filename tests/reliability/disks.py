@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.reliability.outcome import Outcome
@@ -22,10 +23,10 @@ def is_possible() -> bool:
     return done.returncode == 0
 
 
-def disks(work: Path) -> list[Outcome]:
+def disks(work: Path, *, harms: Sequence[str] = HARMS) -> list[Outcome]:
     """Do each harm to a real training."""
     data = make_data(work / "data")
-    return [_outcome(how, _harmed(how, work, data)) for how in HARMS]
+    return [_outcome(how, _harmed(how, work, data)) for how in harms]
 
 
 def _harmed(how: str, work: Path, data: Path) -> dict[str, object]:
