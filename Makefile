@@ -61,7 +61,7 @@ eval-demo: $(STAMP) ## Evaluate the demo on its test trajectories and print the 
 video-demo: $(STAMP) ## Film a predicted rollout of the demo
 	$(BIN)/vpd-render ckpt=$(DEMO_RUN)/checkpoints/last.ckpt data.folder=$(DEMO_DATA) out=$(call NEW_FOLDER,$(DEMO_RUN)/render)
 
-test: $(STAMP) ## Run all tests (no GPU and no torch-cluster needed; about 13 minutes on two cores)
+test: $(STAMP) ## Run all tests (no GPU and no torch-cluster needed; about 17 minutes on two cores)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --durations=15 --durations-min=5
 
 test-fast: $(STAMP) ## Run the tests that are not marked slow, without the stability matrix (under 2 minutes)

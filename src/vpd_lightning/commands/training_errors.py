@@ -41,7 +41,9 @@ def named_disk_errors(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         names = [Path(str(name)) for name in (error.filename, error.filename2) if name is not None]
-        if error.errno not in _DISK_ERRORS and not any(name.is_relative_to(folder) for name in names):
+        # A file elsewhere (data, say) is another fault; what is already open for writing has no name here.
+        is_ours = any(name.is_relative_to(folder) for name in names) if names else error.errno in _DISK_ERRORS
+        if not is_ours:
             raise
         what = f"{names[0]} could not be written" if names else f"nothing more could be written in {folder}"
         raise CheckpointError(
