@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vpd_lightning.editing.scene_editor import SceneEditor
     from vpd_lightning.loading import load
     from vpd_lightning.simulator import Scene, Simulator
     from vpd_lightning.types import Cameras, Particles
@@ -22,11 +23,12 @@ _HOMES = {
     "Cameras": "vpd_lightning.types",
     "Particles": "vpd_lightning.types",
     "Scene": "vpd_lightning.simulator",
+    "SceneEditor": "vpd_lightning.editing.scene_editor",
     "Simulator": "vpd_lightning.simulator",
     "load": "vpd_lightning.loading",
 }
 
-__all__ = ["Cameras", "Particles", "Scene", "Simulator", "__version__", "load"]
+__all__ = ["Cameras", "Particles", "Scene", "SceneEditor", "Simulator", "__version__", "load"]
 
 
 def __getattr__(name: str) -> Any:

@@ -13,6 +13,10 @@ class ConfigError(VPDError):
     exit_code = 2
 
 
+class EditError(ConfigError):
+    """An edit of a scene that means nothing, selects nothing, or cannot be read."""
+
+
 class DataError(VPDError):
     """A data set or recording is missing, broken, or does not fit the configuration."""
 
