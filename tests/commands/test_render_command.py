@@ -65,6 +65,55 @@ def test_a_ring_films_at_any_size(checkpoint: Path, tmp_path: Path) -> None:
     assert image.shape[0] / image.shape[1] == pytest.approx(40 / 60)
 
 
+def test_one_moment_is_filmed_from_a_ring(checkpoint: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ["camera=ring", "freeze_step=3", "num_views=5", "save_particles=[ply]", f"out={out}"]
+    assert main([f"ckpt={checkpoint}", *words]) == 0
+    assert names(out) == ["contact_sheet.png", "particles", "particles.png", "render.json", "ring.png", "ring.webm"]
+    assert num_frames(out / "ring.webm") == 5
+    assert names(out / "particles") == ["0003.ply"]
+    described = json.loads((out / "render.json").read_text())
+    assert described["freeze_step"] == 3 and described["num_steps"] == 3
+
+
+def test_one_moment_of_the_recordings_cameras_is_compared_with_the_truth(checkpoint: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ["camera=all", "freeze_step=2", "save_maps=[depth]", "save_particles=[]", f"out={out}"]
+    assert main([f"ckpt={checkpoint}", *words]) == 0
+    pictures = [f"camera_0{view}{kind}" for view in range(2) for kind in (".png", "_maps.npz")]
+    assert names(out) == sorted([*pictures, "contact_sheet.png", "particles.png", "render.json"])
+    assert json.loads((out / "render.json").read_text())["films"] == []
+    # Truth, prediction, error and depth below each other, 256 pixels and more each; a bar on top and one with labels.
+    assert cv2.imread(str(out / "contact_sheet.png")).shape[0] > 4 * 256
+
+
+def test_a_frozen_moment_is_the_same_as_in_the_film(checkpoint: Path, tmp_path: Path) -> None:
+    words = [f"ckpt={checkpoint}", "camera=1", "save_maps=[depth,opacity]", "save_particles=[npz]"]
+    assert main([*words, "num_steps=3", f"out={tmp_path}/film"]) == 0
+    assert main([*words, "freeze_step=2", f"out={tmp_path}/moment"]) == 0
+    film, moment = (np.load(tmp_path / name / "camera_01_maps.npz") for name in ("film", "moment"))
+    assert film["depth"].shape == (4, SIZE, SIZE) and film["depth"].dtype == np.float32
+    assert np.array_equal(film["depth"][2], moment["depth"][0])
+    assert np.array_equal(film["opacity"][2], moment["opacity"][0])
+    assert np.allclose(film["cam_to_world"], CAM_TO_WORLD[1], atol=1e-6) and film["intrinsics"].shape == (4, 3, 3)
+    assert num_frames(tmp_path / "film" / "camera_01_depth.webm") == 4
+    assert num_frames(tmp_path / "film" / "camera_01_opacity.webm") == 4
+    particles = [np.load(tmp_path / name / "particles" / "0002.npz")["positions"] for name in ("film", "moment")]
+    assert np.array_equal(*particles)
+
+
+def test_a_written_camera_path_films_the_same_again(checkpoint: Path, tmp_path: Path) -> None:
+    words = [f"ckpt={checkpoint}", "num_steps=2", "save_particles=[]", "save_maps=[depth]"]
+    assert main([*words, "camera=ring", "save_camera_path=true", f"out={tmp_path}/ring"]) == 0
+    written = tmp_path / "ring" / "camera_path.json"
+    assert len(json.loads(written.read_text())["camera_path"]) == 3
+    assert main([*words, f"camera={written}", f"out={tmp_path}/path"]) == 0
+    ring, path = (np.load(tmp_path / f) for f in ("ring/ring_maps.npz", "path/path_maps.npz"))
+    assert np.allclose(ring["depth"], path["depth"], atol=1e-4)
+    assert np.allclose(ring["cam_to_world"], path["cam_to_world"], atol=1e-6)
+    assert np.allclose(ring["intrinsics"], path["intrinsics"], atol=1e-4)
+
+
 @pytest.mark.parametrize(("moving", "expected"), [(False, ["novel_00.webm", "novel_01.webm"]), (True, ["path.webm"])])
 def test_cameras_of_a_file(checkpoint: Path, tmp_path: Path, moving: bool, expected: list[str]) -> None:
     cameras = [
@@ -99,6 +148,13 @@ def test_a_file_with_the_recorded_camera_gives_the_same_film(checkpoint: Path, t
         (["fps=0"], 2, "fps=0"),
         (["height=0"], 2, "height=0"),
         (["save_particles=[obj]"], 2, "'obj'"),
+        (["save_maps=[normals]"], 2, "'normals'"),
+        (["save_maps=[depth,depth]"], 2, "a word twice"),
+        (["freeze_step=-1"], 2, "freeze_step=-1"),
+        (["freeze_step=1", "num_views=0", "camera=ring"], 2, "num_views=0"),
+        (["num_views=4", "camera=ring"], 2, "freeze_step=STEP"),
+        (["freeze_step=1", "num_views=4"], 2, "camera=ring"),
+        (["save_camera_path=true", "width=40", "camera=ring"], 2, "save_camera_path=false"),
         (["split=tests"], 3, "split 'tests'"),
         (["camra=ring"], 2, "camra"),
     ],

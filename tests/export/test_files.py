@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from vpd_lightning.errors import ConfigError, DataError
 from vpd_lightning.export.camera_paths import common_target, look_at, read_camera_file, resized, ring_cameras
 from vpd_lightning.export.output_folder import OutputFolder, beside_checkpoint, choose_folder
 from vpd_lightning.export.particle_colors import particle_colors
-from vpd_lightning.export.particle_files import write_particles, write_ply
+from vpd_lightning.export.particle_files import write_glb, write_particles, write_ply
 from vpd_lightning.export.pictures import write_contact_sheet, write_particle_plot
 from vpd_lightning.geometry.cameras import pixel_rays, project
 from vpd_lightning.randomness import RandomKeys
@@ -39,6 +40,47 @@ def test_ply_holds_the_points_and_their_colours(tmp_path: Path) -> None:
     ]
     rows = np.frombuffer(body, dtype=[("position", "<f4", 3), ("color", "u1", 3)])
     assert np.array_equal(rows["position"], positions) and np.array_equal(rows["color"], colors)
+
+
+def cloud() -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(1)
+    return random.normal(size=(50, 3)).astype(np.float32), random.integers(0, 256, size=(50, 3), dtype=np.uint8)
+
+
+def test_trimesh_reads_the_ply_to_the_last_bit(tmp_path: Path) -> None:
+    positions, colors = cloud()
+    write_ply(tmp_path / "p.ply", positions, colors)
+    read = trimesh.load(tmp_path / "p.ply")
+    assert np.asarray(read.vertices, np.float32).tobytes() == positions.tobytes()
+    assert np.array_equal(read.colors[:, :3], colors)
+
+
+def test_glb_holds_the_same_bits_and_stands_upright(tmp_path: Path) -> None:
+    positions, colors = cloud()
+    write_glb(tmp_path / "p.glb", positions, colors)
+    # The file by its own header: JSON chunk, then a binary chunk with the two buffers.
+    content = (tmp_path / "p.glb").read_bytes()
+    assert content[:4] == b"glTF"
+    length = int.from_bytes(content[12:16], "little")
+    header, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+    (primitive,) = header["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0, "points"
+    stored = {}
+    for name, number in primitive["attributes"].items():
+        accessor = header["accessors"][number]
+        start = header["bufferViews"][accessor["bufferView"]].get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        width = {"VEC3": 3, "VEC4": 4}[accessor["type"]]
+        stored[name] = np.frombuffer(binary, kind, accessor["count"] * width, start).reshape(-1, width)
+    assert stored["POSITION"].tobytes() == positions.tobytes()
+    assert np.array_equal(stored["COLOR_0"][:, :3], colors) and (stored["COLOR_0"][:, 3] == 255).all()
+    # trimesh, and what a viewer with y up sees: the world's z.
+    scene = trimesh.load(tmp_path / "p.glb")
+    (geometry,) = scene.geometry.values()
+    assert np.asarray(geometry.vertices, np.float32).tobytes() == positions.tobytes()
+    assert np.array_equal(geometry.colors[:, :3], colors)
+    seen = scene.to_geometry().vertices
+    assert np.allclose(seen, np.stack([positions[:, 0], positions[:, 2], -positions[:, 1]], axis=1), atol=1e-6)
 
 
 def test_npz_holds_positions_features_and_colours(tmp_path: Path) -> None:

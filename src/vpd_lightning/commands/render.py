@@ -32,6 +32,9 @@ def _render(config: Mapping[str, Any]) -> None:
     from vpd_lightning.data.manifest import file_sha256, load_manifest
     from vpd_lightning.errors import OutOfMemoryError
     from vpd_lightning.evaluation import filming
+    from vpd_lightning.evaluation.clip import encode_clip
+    from vpd_lightning.evaluation.viewpoints import choose_viewpoints, resize_viewpoints
+    from vpd_lightning.export.nerfstudio_paths import write_camera_path
     from vpd_lightning.export.output_folder import OutputFolder, beside_checkpoint, choose_folder
     from vpd_lightning.loading import load_model
     from vpd_lightning.simulator import Simulator
@@ -46,24 +49,34 @@ def _render(config: Mapping[str, Any]) -> None:
         )
     manifest = load_manifest(data_folder(config["data"]["folder"], model.config))
     path = _choose_trajectory(manifest.split(config["split"]), config)
-    start, num_steps = config["start_frame"], config["num_steps"]
+    start, freeze_step = config["start_frame"], config["freeze_step"]
     clip = filming.read_context(path, start)
-    chosen = filming.choose_viewpoints(config["camera"], path, start, num_steps + 1, model.input_views)
-    viewpoints = filming.resize_viewpoints(chosen, config["height"], config["width"])
+    num_frames = (config["num_views"] if freeze_step is not None else None) or config["num_steps"] + 1
+    chosen = choose_viewpoints(
+        config["camera"], path, start, num_frames, model.input_views, frozen=freeze_step is not None
+    )
+    viewpoints = resize_viewpoints(chosen, config["height"], config["width"])
     folder = choose_folder(config["out"], beside_checkpoint(model.path, "render"))
     with OutputFolder(folder) as partial:
+        if config["save_camera_path"]:  # first: cameras that the format cannot hold are refused before the work
+            write_camera_path(partial / "camera_path.json", viewpoints.cameras, config["fps"], viewpoints.is_cycle)
         try:
             with show_progress() as progress:
-                states, frames = filming.film(model.simulator, clip, num_steps, model.input_views, viewpoints, progress)
+                scene = encode_clip(model.simulator, clip, model.input_views)
+                states = filming.predict(model.simulator, scene, config["num_steps"], freeze_step)
+                filmed = filming.film(model.simulator, list(states.values()), viewpoints, progress)
         except torch.OutOfMemoryError as error:
             raise OutOfMemoryError(
                 "The device ran out of memory while rendering.\nLower height and width, or use device=cpu."
             ) from error
         truth = None
         if viewpoints.views is not None:
-            truth = filming.recorded_frames(path, start, num_steps, viewpoints.views)
-        filming.write_films(partial, viewpoints, frames.numpy(), truth, config["fps"])
+            truth = filming.recorded_frames(path, start, list(states), viewpoints.views)
+        filming.write_films(partial, viewpoints, filmed, truth, config["fps"], config["save_maps"])
+        if freeze_step is not None:
+            filming.write_moment_sheet(partial, viewpoints, filmed, truth, freeze_step, config["save_maps"])
         filming.write_particle_folder(partial, model.simulator, clip, states, config["save_particles"])
+        is_film = filmed.rgb.shape[0] > 1
         filming.write_description(
             partial / "render.json",
             {
@@ -72,20 +85,25 @@ def _render(config: Mapping[str, Any]) -> None:
                 "data": str(manifest.folder),
                 "trajectory": manifest.relative(path),
                 "start_frame": start,
-                "num_steps": num_steps,
+                "num_steps": max(states),
+                "freeze_step": freeze_step,
                 "camera": config["camera"],
                 "height": viewpoints.cameras.height,
                 "width": viewpoints.cameras.width,
-                "films": [f"{name}.webm" for name in viewpoints.names],
+                "films": [f"{name}.webm" for name in viewpoints.names] if is_film else [],
+                "maps": config["save_maps"],
             },
         )
     count = len(viewpoints.names)
-    films = "1 film" if count == 1 else f"{count} films"
-    print(f"{films} of {num_steps} steps from {manifest.relative(path)}, start frame {start}")
+    kind = "film" if is_film else "picture"
+    films = f"1 {kind}" if count == 1 else f"{count} {kind}s"
+    moment = f"of {max(states)} steps" if freeze_step is None else f"of step {freeze_step}"
+    print(f"{films} {moment} from {manifest.relative(path)}, start frame {start}")
     print(folder)
 
 
 def _check(config: Mapping[str, Any]) -> None:
+    from vpd_lightning.evaluation.filmed_maps import MAPS
     from vpd_lightning.evaluation.filming import PARTICLE_FORMATS
 
     for name, lowest in (("num_steps", 1), ("start_frame", 0), ("trajectory", 0)):
@@ -96,11 +114,23 @@ def _check(config: Mapping[str, Any]) -> None:
             raise ConfigError(f"{name}={config[name]} is out of range.\nAllowed: 1 pixel or more, or null.")
     if not 0 < config["fps"] <= 1000:
         raise ConfigError(f"fps={config['fps']} is out of range.\nAllowed: above 0, up to 1000.")
-    unknown = [name for name in config["save_particles"] if name not in PARTICLE_FORMATS]
-    if unknown:
+    if config["freeze_step"] is not None and config["freeze_step"] < 0:
         raise ConfigError(
-            f"save_particles has {unknown[0]!r}.\nAllowed: {', '.join(PARTICLE_FORMATS)}, or [] for none."
+            f"freeze_step={config['freeze_step']} is out of range.\nAllowed: 0 (the last input frame) or more, or null."
         )
+    if config["num_views"] is not None:
+        if config["num_views"] < 1:
+            raise ConfigError(f"num_views={config['num_views']} is out of range.\nAllowed: 1 or more, or null.")
+        if config["freeze_step"] is None or config["camera"] != "ring":
+            raise ConfigError(
+                "num_views counts the places of a ring around a moment that stands still.\n"
+                "Set camera=ring and freeze_step=STEP, or leave num_views out."
+            )
+    for name, allowed in (("save_particles", PARTICLE_FORMATS), ("save_maps", MAPS)):
+        unknown = [word for word in config[name] if word not in allowed]
+        if unknown or len(set(config[name])) < len(config[name]):
+            said = repr(unknown[0]) if unknown else "a word twice"
+            raise ConfigError(f"{name} has {said}.\nAllowed: {', '.join(allowed)}, or [] for none.")
 
 
 def _choose_trajectory(paths: Sequence[Path], config: Mapping[str, Any]) -> Path:

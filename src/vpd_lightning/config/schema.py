@@ -157,12 +157,16 @@ class RenderConfig:
     trajectory: int = MISSING
     start_frame: int = MISSING
     num_steps: int = MISSING
+    freeze_step: int | None = None
     camera: Any = MISSING
+    num_views: int | None = None
     height: int | None = None
     width: int | None = None
     fps: float = MISSING
     out: str | None = None
     save_particles: list[str] = MISSING
+    save_maps: list[str] = MISSING
+    save_camera_path: bool = MISSING
     device: str = MISSING
     num_threads: int | None = None
     debug: bool = MISSING

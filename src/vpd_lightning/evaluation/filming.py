@@ -8,121 +8,106 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.data.schema import AtomicPath
-from vpd_lightning.errors import ConfigError
-from vpd_lightning.evaluation.clip import encode_clip
-from vpd_lightning.evaluation.protocol import Clip, read_cameras, read_clip
-from vpd_lightning.export.camera_paths import common_target, read_camera_file, resized, ring_cameras
+from vpd_lightning.evaluation.filmed_maps import map_pictures, write_maps, z_depth
+from vpd_lightning.evaluation.protocol import Clip, read_clip
+from vpd_lightning.evaluation.viewpoints import Viewpoints
 from vpd_lightning.export.particle_colors import particle_colors
-from vpd_lightning.export.particle_files import write_particles, write_ply
-from vpd_lightning.export.pictures import write_contact_sheet, write_particle_plot, write_png
-from vpd_lightning.export.video import comparison_frames, enlarge, write_video
-from vpd_lightning.simulator import Simulator
-from vpd_lightning.types import Cameras, Particles
+from vpd_lightning.export.particle_files import WRITERS
+from vpd_lightning.export.pictures import write_contact_sheet, write_particle_plot, write_png, write_view_sheet
+from vpd_lightning.export.video import comparison_frames, enlarge, error_image, write_video
+from vpd_lightning.simulator import Scene, Simulator
+from vpd_lightning.types import Particles
 
-PARTICLE_FORMATS = ("ply", "npz")
+PARTICLE_FORMATS = tuple(WRITERS)
 _MAX_PANELS = 4
+_MAX_SHEET_VIEWS = 8
 
 
 @dataclass(frozen=True)
-class Viewpoints:
-    """Where to film from. ``moving``: ``cameras`` are the places of one camera, one per frame; else each makes a film.
+class Film:
+    """What the cameras saw: colours, z-depth in metres (0 where it is no number) and opacity in [0, 1].
 
-    ``views`` are the numbers of recorded cameras, for comparison with the truth; None for cameras of no recording.
+    The axis ``camera`` has length 1 for a moving camera.
     """
 
-    cameras: Cameras
-    moving: bool
-    views: list[int] | None
-    names: list[str]
+    rgb: UInt8[Tensor, "time camera height width 3"]
+    depth: Float[Tensor, "time camera height width"]
+    opacity: Float[Tensor, "time camera height width"]
+
+    def maps(self, names: Sequence[str], camera: int) -> dict[str, NDArray[np.float32]]:
+        """Return the named maps of one camera, each (time, height, width)."""
+        return {name: getattr(self, name)[:, camera].numpy() for name in names}
 
 
-def choose_viewpoints(
-    camera: str | int | Sequence[int], path: Path, start: int, num_frames: int, input_views: Sequence[int]
-) -> Viewpoints:
-    """Turn ``input``, ``all``, numbers of recorded cameras, ``ring`` or the name of a JSON file into cameras.
+def predict(simulator: Simulator, scene: Scene, num_steps: int, freeze_step: int | None) -> dict[int, Particles]:
+    """Roll out, and return the states to film by their steps; step 0 is the last input frame.
 
-    Raises:
-        ConfigError: a word that means nothing, or a camera that the recording lacks.
-        DataError: a bad camera file.
+    With ``freeze_step`` that is one state, so many steps after the last input frame.
     """
-    with TrajectoryReader(path) as reader:
-        recorded = read_cameras(reader, [start + 1], range(reader.num_views))[0]
-        low, high = torch.tensor(reader.workspace_min), torch.tensor(reader.workspace_max)
-    if camera == "ring":
-        target = common_target(recorded, ((low + high) / 2).float())
-        return Viewpoints(ring_cameras(recorded, num_frames, target), True, None, ["ring"])
-    if isinstance(camera, str) and camera.endswith(".json"):
-        cameras, moving = read_camera_file(Path(camera).expanduser())
-        if moving and cameras.shape[0] < num_frames:
-            raise ConfigError(
-                f"{camera} has {cameras.shape[0]} places of a moving camera; {num_frames} frames are filmed.\n"
-                f"Lower num_steps to {cameras.shape[0] - 1}, or add places."
-            )
-        names = ["path"] if moving else [f"novel_{number:02d}" for number in range(cameras.shape[0])]
-        return Viewpoints(cameras[:num_frames] if moving else cameras, moving, None, names)
-    views = _recorded_views(camera, recorded.shape[0], input_views)
-    return Viewpoints(recorded[views], False, views, [f"camera_{view:02d}" for view in views])
-
-
-def _recorded_views(camera: str | int | Sequence[int], num_views: int, input_views: Sequence[int]) -> list[int]:
-    if camera == "input":
-        views = list(input_views)
-    elif camera == "all":
-        views = list(range(num_views))
-    elif isinstance(camera, int):
-        views = [camera]
-    elif isinstance(camera, list | tuple) and camera and all(isinstance(view, int) for view in camera):
-        views = list(camera)
-    else:
-        raise ConfigError(
-            f"camera={camera} means nothing.\nAllowed: input, all, ring, a number, a list [0,5], or FILE.json."
-        )
-    wrong = [view for view in views if not 0 <= view < num_views]
-    if wrong:
-        raise ConfigError(f"There is no camera {wrong[0]}: the recording has {num_views} (0 to {num_views - 1}).")
-    return views
+    last = num_steps if freeze_step is None else freeze_step
+    states = dict(enumerate([scene.current, *simulator.rollout(scene, last)]))
+    return states if freeze_step is None else {freeze_step: states[freeze_step]}
 
 
 def film(
     simulator: Simulator,
-    clip: Clip,
-    num_steps: int,
-    input_views: Sequence[int],
+    states: Sequence[Particles],
     viewpoints: Viewpoints,
     progress: Callable[[str, int, int], None],
-) -> tuple[list[Particles], UInt8[Tensor, "time camera height width 3"]]:
-    """Roll out ``num_steps`` steps and render them; time 0 is the last input frame, reconstructed.
+) -> Film:
+    """Render the states; a moving camera has one place for each, or, where there is only one state, shows that one.
 
-    For a moving camera the camera axis has length 1.
+    Raises:
+        ValueError: a moving camera with another number of places.
     """
-    scene = encode_clip(simulator, clip, input_views)
-    states = [scene.current, *simulator.rollout(scene, num_steps)]
-    frames = []
-    for time, state in enumerate(states):
-        progress("frames", time, len(states))
-        cameras = viewpoints.cameras[time : time + 1] if viewpoints.moving else viewpoints.cameras
-        image = simulator.render([state], cameras)[0]
-        frames.append((image.float().nan_to_num(0.0).clamp(0, 1) * 255).round().to(torch.uint8).cpu())
-    return states, torch.stack(frames)
+    cameras = viewpoints.cameras
+    if not viewpoints.moving:
+        shots = [(state, cameras) for state in states]
+    else:
+        seen = list(states) * cameras.shape[0] if len(states) == 1 else states
+        shots = [
+            (state, cameras[place : place + 1]) for place, state in zip(range(cameras.shape[0]), seen, strict=True)
+        ]
+    frames: dict[str, list[Tensor]] = {"rgb": [], "depth": [], "opacity": []}
+    for number, (state, there) in enumerate(shots):
+        progress("frames", number, len(shots))
+        seen_maps = simulator.render_maps([state], there)
+        colors = seen_maps.rgbs[0].float().nan_to_num(0.0).clamp(0, 1)
+        depth = z_depth(seen_maps.depths[0].float().cpu(), there.to("cpu"))
+        frames["rgb"].append((colors * 255).round().to(torch.uint8).cpu())
+        frames["depth"].append(depth.nan_to_num(0.0, posinf=0.0, neginf=0.0))
+        frames["opacity"].append(seen_maps.opacities[0].float().nan_to_num(0.0).clamp(0, 1).cpu())
+    return Film(**{name: torch.stack(parts) for name, parts in frames.items()})
 
 
 def write_films(
-    folder: Path, viewpoints: Viewpoints, frames: NDArray[np.uint8], truth: NDArray[np.uint8] | None, fps: float
+    folder: Path,
+    viewpoints: Viewpoints,
+    filmed: Film,
+    truth: NDArray[np.uint8] | None,
+    fps: float,
+    save_maps: Sequence[str],
 ) -> None:
-    """Write one film per camera, a picture of the middle frame, and comparisons where the ``truth`` is given.
+    """Write one film per camera, a picture of the middle frame, its maps, and comparisons where the ``truth`` is given.
 
-    ``frames`` and ``truth`` are (time, camera, height, width, 3).
+    ``truth`` is (time, camera, height, width, 3). A single frame makes a picture, and no film.
     """
+    frames = filmed.rgb.numpy()
     for number, name in enumerate(viewpoints.names):
-        write_video(folder / f"{name}.webm", np.stack([enlarge(image) for image in frames[:, number]]), fps)
+        if len(frames) > 1:
+            write_video(folder / f"{name}.webm", np.stack([enlarge(image) for image in frames[:, number]]), fps)
         write_png(folder / f"{name}.png", enlarge(frames[len(frames) // 2, number]))
-    if truth is None:
+        if save_maps:
+            cameras = viewpoints.cameras if viewpoints.moving else viewpoints.cameras[number]
+            opacity = filmed.opacity[:, number].numpy()
+            write_maps(folder, name, filmed.maps(save_maps, number), opacity, cameras, fps)
+    if truth is None or len(frames) == 1:
         return
     labels = [f"step {step}" for step in range(len(frames))]
     for number, name in enumerate(viewpoints.names):
@@ -132,49 +117,76 @@ def write_films(
     write_contact_sheet(folder / "contact_sheet.png", rows, steps, "truth, prediction and error")
 
 
-def write_particle_folder(
-    folder: Path, simulator: Simulator, clip: Clip, states: Sequence[Particles], formats: Sequence[str]
+def write_moment_sheet(
+    folder: Path,
+    viewpoints: Viewpoints,
+    filmed: Film,
+    truth: NDArray[np.uint8] | None,
+    step: int,
+    save_maps: Sequence[str],
 ) -> None:
-    """Write each step's particles as ``particles/0000.ply`` and ``.npz``, and ``particles.png``."""
+    """Write ``contact_sheet.png``: one predicted moment from every camera, or from up to eight places of a moving one.
+
+    ``truth`` is (time=1, camera, height, width, 3), and only there for cameras of the recording.
+    """
+    axis = 1 if viewpoints.moving else 0  # what has length 1: the cameras, or the moments
+    images = filmed.rgb.select(axis, 0).numpy()
+    picked = _places(len(images), viewpoints.is_cycle)
+    lines: dict[str, NDArray[np.uint8]] = {"prediction": images[picked]}
+    if truth is not None:
+        shown = truth[0][picked]
+        lines = {"truth": shown, **lines, "error": error_image(lines["prediction"], shown)}
+    maps = {name: getattr(filmed, name).select(axis, 0).numpy()[picked] for name in save_maps}
+    notes = []
+    opacity = filmed.opacity.select(axis, 0).numpy()[picked]
+    for kind, (pictures, says) in map_pictures(maps, opacity).items():
+        lines[kind] = pictures
+        notes.append(says)
+    title = "; ".join([f"step {step}", *notes])
+    write_view_sheet(folder / "contact_sheet.png", lines, [viewpoints.labels[i] for i in picked], title)
+
+
+def _places(count: int, is_cycle: bool) -> NDArray[np.int64]:
+    """Choose up to eight places evenly: both ends of a path, the first end alone of what ends where it began."""
+    if count <= _MAX_SHEET_VIEWS:
+        return np.arange(count)
+    return np.linspace(0, count if is_cycle else count - 1, _MAX_SHEET_VIEWS, endpoint=not is_cycle).round().astype(int)
+
+
+def write_particle_folder(
+    folder: Path, simulator: Simulator, clip: Clip, states: Mapping[int, Particles], formats: Sequence[str]
+) -> None:
+    """Write each step's particles as ``particles/0000.ply``, ``.npz`` and ``.glb``, and ``particles.png``."""
     viewpoint = clip.cameras.cam_to_world[1, :, :3, 3].mean(0)
-    shown = set(np.unique(np.linspace(0, len(states) - 1, min(len(states), _MAX_PANELS)).round().astype(int)).tolist())
+    steps = list(states)
+    shown = {steps[i] for i in np.linspace(0, len(steps) - 1, min(len(steps), _MAX_PANELS)).round().astype(int)}
     panels = []
     if formats:
         (folder / "particles").mkdir()
-    for step, state in enumerate(states):
+    for step, state in states.items():
         if not formats and step not in shown:
             continue
         colors = particle_colors(simulator.renderer, state, viewpoint)
         there = state.mask[0]
         positions = state.positions[0][there].float().cpu().numpy()
         features = state.features[0][there].float().cpu().numpy()
-        if "ply" in formats:
-            write_ply(folder / "particles" / f"{step:04d}.ply", positions, colors)
-        if "npz" in formats:
-            write_particles(folder / "particles" / f"{step:04d}.npz", positions, features, colors)
+        for kind in formats:
+            WRITERS[kind](folder / "particles" / f"{step:04d}.{kind}", positions, features, colors)
         if step in shown:
             panels.append((f"step {step}", positions, colors))
     write_particle_plot(folder / "particles.png", panels, clip.workspace_min, clip.workspace_max)
 
 
-def recorded_frames(path: Path, start: int, num_steps: int, views: Sequence[int]) -> NDArray[np.uint8] | None:
-    """True images (time, view, ...) from the last input frame on; None where the recording is shorter."""
+def recorded_frames(path: Path, start: int, steps: Sequence[int], views: Sequence[int]) -> NDArray[np.uint8] | None:
+    """True images (time, view, ...) at ``steps`` (0 is the last input frame); None where the recording is shorter."""
     with TrajectoryReader(path) as reader:
-        if start + 2 + num_steps > reader.num_frames:
-            return None
-        return reader.rgb(range(start + 1, start + 2 + num_steps), views)
+        frames = [start + 1 + step for step in steps]
+        return None if frames[-1] >= reader.num_frames else reader.rgb(frames, views)
 
 
 def read_context(path: Path, start: int) -> Clip:
     """Read the two context frames of a clip; DataError where the recording lacks them."""
     return read_clip(path, 0, start, num_steps=0, with_state=False)
-
-
-def resize_viewpoints(viewpoints: Viewpoints, height: int | None, width: int | None) -> Viewpoints:
-    """Return the same viewpoints at another image size; other sizes have no truth to compare with."""
-    cameras = resized(viewpoints.cameras, height, width)
-    same = (cameras.height, cameras.width) == (viewpoints.cameras.height, viewpoints.cameras.width)
-    return Viewpoints(cameras, viewpoints.moving, viewpoints.views if same else None, viewpoints.names)
 
 
 def write_description(path: Path, content: Mapping[str, Any]) -> None:

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from vpd_lightning.data.reader import check_intrinsics, check_poses
 from vpd_lightning.errors import ConfigError, DataError
+from vpd_lightning.export.nerfstudio_paths import is_camera_path, parse_camera_path
 from vpd_lightning.types import Cameras
 
 _MAX_CAMERAS = 100_000
@@ -66,33 +68,51 @@ def resized(cameras: Cameras, height: int | None, width: int | None) -> Cameras:
 def read_camera_file(path: Path) -> tuple[Cameras, bool]:
     """Read cameras from JSON; also tells whether they are the places of one moving camera.
 
-    ``{"height": H, "width": W, "moving": false, "cameras": [{"intrinsics": 3x3 pixels, "cam_to_world": 4x4 metres}]}``
+    ``{"height": H, "width": W, "moving": false, "cameras": [{"intrinsics": 3x3 pixels, "cam_to_world": 4x4 metres}]}``,
+    or a camera path of nerfstudio (see ``nerfstudio_paths``), whose camera always moves.
 
     Raises:
-        DataError: the file is missing or is not that.
+        DataError: the file is missing or is neither.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(f"There is no camera file {path}.\nGive input, all, ring, [0,5] or a JSON file.") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path} is not a camera file: {type(error).__name__} {error}.\n{_EXPECTED}") from error
+    from_nerfstudio = is_camera_path(content)
+    parse = parse_camera_path if from_nerfstudio else _parse_own
+    intrinsics, poses, height, width = parse(path, content)
+    if max(height, width) > _MAX_SIDE or len(poses) > _MAX_CAMERAS:
+        raise DataError(
+            f"{path} has {len(poses)} cameras of {height}x{width} pixels.\n"
+            f"Allowed: {_MAX_CAMERAS} cameras, {_MAX_SIDE} pixels a side."
+        )
+    cameras = Cameras(_float32(intrinsics), _float32(poses), height, width)
+    return cameras, from_nerfstudio or bool(content.get("moving", False))
+
+
+def _parse_own(path: Path, content: Any) -> tuple[NDArray[np.float64], NDArray[np.float64], int, int]:
+    try:
         cameras = content["cameras"]
         height, width = content["height"], content["width"]
         intrinsics = np.array([camera["intrinsics"] for camera in cameras], dtype=np.float64)
         poses = np.array([camera["cam_to_world"] for camera in cameras], dtype=np.float64)
-    except FileNotFoundError:
-        raise DataError(f"There is no camera file {path}.\nGive input, all, ring, [0,5] or a JSON file.") from None
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, IndexError) as error:
         raise DataError(f"{path} is not a camera file: {type(error).__name__} {error}.\n{_EXPECTED}") from error
-    sizes_fit = all(isinstance(side, int) and 1 <= side <= _MAX_SIDE for side in (height, width))
-    if not sizes_fit or not 1 <= len(cameras) <= _MAX_CAMERAS:
+    if not all(isinstance(side, int) and side >= 1 for side in (height, width)) or not cameras:
         raise DataError(f"{path} has {len(cameras)} cameras of {height!r}x{width!r} pixels.\n{_EXPECTED}")
     if intrinsics.shape[1:] != (3, 3) or poses.shape[1:] != (4, 4):
         raise DataError(f"{path} has matrices of shapes {intrinsics.shape[1:]}, {poses.shape[1:]}.\n{_EXPECTED}")
     check_intrinsics(path, intrinsics, height, width)
     check_poses(path, poses)
-    moving: Any = content.get("moving", False)
-    return Cameras(_float32(intrinsics), _float32(poses), height, width), bool(moving)
+    return intrinsics, poses, height, width
 
 
-_EXPECTED = 'Expected: {"height": 128, "width": 128, "cameras": [{"intrinsics": 3x3, "cam_to_world": 4x4}, ...]}.'
+_EXPECTED = (
+    'Expected: {"height": 128, "width": 128, "cameras": [{"intrinsics": 3x3, "cam_to_world": 4x4}, ...]}, '
+    'or a camera path of nerfstudio ("camera_path": [...]).'
+)
 
 
 def _float32(array: np.ndarray) -> Tensor:

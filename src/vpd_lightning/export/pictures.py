@@ -88,6 +88,26 @@ def write_contact_sheet(
     write_png(path, np.concatenate([*heads, *blocks]))
 
 
+def write_view_sheet(path: Path, lines: Mapping[str, NDArray[np.uint8]], labels: Sequence[str], title: str) -> None:
+    """Draw named lines of images (view, height, width, 3) below each other; a column is one view and has its label.
+
+    More than four views go on in a further block.
+    """
+    blocks = []
+    for first in range(0, len(labels), _COLUMNS):
+        here = slice(first, first + _COLUMNS)
+        rows = [np.concatenate([framed(enlarge(image)) for image in images[here]], axis=1) for images in lines.values()]
+        picture = np.concatenate(rows)
+        each = picture.shape[1] // len(labels[here])
+        head = np.concatenate([label_bar("", _SIDE), *(label_bar(label, each) for label in labels[here])], axis=1)
+        body = np.concatenate([_side_labels(list(lines), picture.shape[0]), picture], axis=1)
+        blocks.append(np.concatenate([head, body]))
+    width = max(block.shape[1] for block in blocks)
+    padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=24) for b in blocks]
+    write_png(path, np.concatenate([label_bar(title, width), *padded]))
+
+
+_COLUMNS = 4
 _SIDE = 84
 
 
