@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from vpd_lightning.editing.scene_editor import SceneEditor
     from vpd_lightning.loading import load
-    from vpd_lightning.simulator import Scene, Simulator
+    from vpd_lightning.simulator import Rollout, Scene, Simulator
     from vpd_lightning.types import Cameras, Particles
 
 try:
@@ -22,13 +22,14 @@ except PackageNotFoundError:  # a checkout on the path that was never installed
 _HOMES = {
     "Cameras": "vpd_lightning.types",
     "Particles": "vpd_lightning.types",
+    "Rollout": "vpd_lightning.simulator",
     "Scene": "vpd_lightning.simulator",
     "SceneEditor": "vpd_lightning.editing.scene_editor",
     "Simulator": "vpd_lightning.simulator",
     "load": "vpd_lightning.loading",
 }
 
-__all__ = ["Cameras", "Particles", "Scene", "SceneEditor", "Simulator", "__version__", "load"]
+__all__ = ["Cameras", "Particles", "Rollout", "Scene", "SceneEditor", "Simulator", "__version__", "load"]
 
 
 def __getattr__(name: str) -> Any:

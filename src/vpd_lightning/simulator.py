@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -23,6 +24,31 @@ class Scene:
 
     previous: Particles
     current: Particles
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A rollout that stands at one step, for programs that decide as they go. ``Simulator.start`` gives the first one.
+
+    ``particles`` are those after ``num_steps`` steps (batch axis of 1), ``previous`` those of the step before. Nothing
+    in it changes: ``step`` returns another rollout, so several plans may go on from the same one. The memory of the
+    dynamics goes along, which a pair of particle sets does not tell: the steps are those of ``Simulator.rollout``.
+    """
+
+    simulator: "Simulator"
+    previous: Particles
+    particles: Particles
+    memory: Any
+    keys: RandomKeys
+    num_steps: int
+
+    @torch.no_grad()
+    def step(self) -> "Rollout":
+        """Return the rollout one step later."""
+        following, memory = self.simulator.dynamics(
+            self.previous, self.particles, self.memory, self.keys, self.num_steps
+        )
+        return replace(self, previous=self.particles, particles=following, memory=memory, num_steps=self.num_steps + 1)
 
 
 class Simulator(AbstractSystem):
@@ -176,6 +202,14 @@ class Simulator(AbstractSystem):
         """Return the predicted particles of the next ``num_steps`` steps (batch axis of 1)."""
         self.eval()
         return self.unroll(scene.previous, scene.current, num_steps, keys or RandomKeys.fixed(1))
+
+    @torch.no_grad()
+    def start(self, scene: Scene, keys: RandomKeys | None = None) -> Rollout:
+        """Return a rollout that stands at the scene and is taken on step by step."""
+        self.eval()
+        keys = keys or RandomKeys.fixed(1)
+        memory = self.dynamics.initialize(scene.previous, scene.current, keys)
+        return Rollout(self, scene.previous, scene.current, memory, keys, 0)
 
     @torch.no_grad()
     def render(self, states: Sequence[Particles], cameras: Cameras) -> Float[Tensor, "time view height width 3"]:
