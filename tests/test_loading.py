@@ -14,7 +14,7 @@ from vpd_lightning.config.migrations import ADDED_SETTINGS
 from vpd_lightning.dynamics.sleeping import SleepingDynamics
 from vpd_lightning.errors import CheckpointError, ConfigError
 from vpd_lightning.loading import find_device, load_model
-from vpd_lightning.training.checkpoint_io import load_checkpoint, write_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint, write_checkpoint
 
 
 def test_a_model_comes_back_as_it_was_saved(tmp_path: Path) -> None:

@@ -123,7 +123,7 @@ class _Stored:
 
 
 def _read(path: Path) -> _Stored:
-    from vpd_lightning.training.checkpoint_io import load_checkpoint
+    from vpd_lightning.training.checkpoint_files import load_checkpoint
     from vpd_lightning.training.checkpoints import find_resume
 
     if is_release(path):

@@ -16,7 +16,7 @@ from vpd_lightning.commands.eval import choose_protocol, main
 from vpd_lightning.commands.evaluation_run import run_evaluation, training_of
 from vpd_lightning.config import compose
 from vpd_lightning.errors import ConfigError
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 
 @pytest.fixture(scope="module")

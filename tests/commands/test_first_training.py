@@ -16,7 +16,7 @@ from vpd_lightning.config import compose, pretraining_config
 from vpd_lightning.config.pretraining import FOLDER
 from vpd_lightning.errors import CheckpointError
 from vpd_lightning.loading import load
-from vpd_lightning.training.checkpoint_io import load_checkpoint, write_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint, write_checkpoint
 from vpd_lightning.training.module import VPDModule
 
 WORDS = ["experiment=mujoco_block", "model=sequential", "budget=tiny", "num_threads=1", "logger=none"]

@@ -15,7 +15,7 @@ from vpd_lightning.commands import train
 from vpd_lightning.commands.run_claim import CLAIM
 from vpd_lightning.commands.sweeps import FINISHED, SweepJob, run_sweep, sweep_jobs
 from vpd_lightning.errors import DataError
-from vpd_lightning.training.checkpoint_io import LAST, load_checkpoint
+from vpd_lightning.training.checkpoint_files import LAST, load_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from vpd_lightning.commands import train
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
 

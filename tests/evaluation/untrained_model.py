@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from vpd_lightning.config import build_simulator, compose
-from vpd_lightning.training.checkpoint_io import write_checkpoint
+from vpd_lightning.training.checkpoint_files import write_checkpoint
 
 OVERRIDES = (
     "scene=tiny",

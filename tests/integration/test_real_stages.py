@@ -13,7 +13,7 @@ from tests.training.tiny_training import SignalAt, tiny_trainer
 from vpd_lightning.config import build, build_list, build_simulator, compose
 from vpd_lightning.data.datamodule import VideoDataModule
 from vpd_lightning.losses.base import AbstractLoss
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 from vpd_lightning.training.checkpoints import find_resume
 from vpd_lightning.training.module import VPDModule
 from vpd_lightning.training.optimization import AbstractOptimization

@@ -16,7 +16,7 @@ from pathlib import Path
 from tests.reliability.killed_training import PLACES
 from tests.reliability.outcome import Outcome
 from tests.reliability.trainings import differences, kill_group, make_data, members, run, start, words
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 STEPS = 240
 SIGNALS = {signal.SIGTERM: 143, signal.SIGINT: 130, signal.SIGUSR1: 138}

@@ -13,7 +13,7 @@ import torch
 from tests.data.recordings import write_recordings
 from tests.reliability.outcome import Outcome
 from tests.reliability.trainings import environment, kill_group, make_data, members, start, words
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 WORLD = 16
 

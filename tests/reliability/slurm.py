@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tests.reliability.outcome import Outcome
 from tests.reliability.trainings import environment, make_data, metrics, start, words
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 CLUSTER = Path(__file__).with_name("one_machine_slurm.sh")
 LOG = Path("docs/results/slurm_requeue.log")

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from vpd_lightning.commands import data
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 TIMED = "rays_per_second"
 

@@ -13,7 +13,8 @@ import torch
 
 from vpd_lightning.config.pretraining import FOLDER
 from vpd_lightning.errors import CheckpointError
-from vpd_lightning.training.checkpoint_io import AtomicCheckpointIO, load_checkpoint, write_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint, write_checkpoint
+from vpd_lightning.training.checkpoint_io import AtomicCheckpointIO
 from vpd_lightning.training.checkpoints import FIRST_TRAINING, find_resume, latest_run
 
 

@@ -12,7 +12,7 @@ from tests.training.tiny_training import tiny_data, tiny_module, tiny_simulator,
 from vpd_lightning.errors import ConfigError, NonFiniteError
 from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.losses.pixel import PixelLoss
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 from vpd_lightning.training.module import VPDModule
 from vpd_lightning.training.optimization import StepDecayAdam
 from vpd_lightning.types import SimulatorOutput, VideoBatch

@@ -13,7 +13,7 @@ import torch
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import SignalAt, tiny_data, tiny_module, tiny_trainer
 from vpd_lightning.data.manifest import load_manifest
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 from vpd_lightning.training.checkpoints import find_resume
 from vpd_lightning.training.module import DATA_SHA256
 

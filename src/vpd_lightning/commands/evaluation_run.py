@@ -7,10 +7,10 @@ from typing import Any
 import torch
 import yaml
 
-from vpd_lightning.commands.eval import choose_protocol, data_folder, set_threads
+from vpd_lightning.commands.eval import choose_protocol, set_threads
+from vpd_lightning.commands.one_recording import data_set
 from vpd_lightning.commands.progress import show_progress
-from vpd_lightning.commands.provide_data import provide_data
-from vpd_lightning.data.manifest import Manifest, file_sha256, load_manifest
+from vpd_lightning.data.manifest import Manifest, file_sha256
 from vpd_lightning.errors import ConfigError, OutOfMemoryError
 from vpd_lightning.evaluation.clip import PredictsVideo, PredictsViews
 from vpd_lightning.evaluation.evaluate import Evaluation, evaluate
@@ -22,7 +22,7 @@ from vpd_lightning.evaluation.summary import summary_lines
 from vpd_lightning.export.output_folder import OutputFolder, beside_checkpoint, choose_folder
 from vpd_lightning.export.release_folder import is_release
 from vpd_lightning.loading import LoadedModel, load_model
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 from vpd_lightning.training.module import DATA_SHA256
 
 _DEFAULT_SYSTEM = "vpd"  # checkpoints from before there were others do not say
@@ -40,7 +40,7 @@ def run_evaluation(config: Mapping[str, Any]) -> Path:
     model = load_model(config["ckpt"], config["device"], config["change"], sleeping=config["sleeping"])
     _require_predictions(model)
     protocol = choose_protocol(config["protocol"], model.config.get("protocol"))
-    manifest = _data_set(config["data"]["folder"], model.config)
+    manifest = data_set(config["data"]["folder"], model.config)
     name = "evaluation" if protocol.split == "test" else f"evaluation_{protocol.split}"
     folder = choose_folder(config["out"], beside_checkpoint(model.path, name))
     with OutputFolder(folder) as partial:
@@ -66,13 +66,6 @@ def _require_predictions(model: LoadedModel) -> None:
             f"{model.path} holds a {type(model.simulator).__name__}, which predicts no video.\n"
             "Evaluate the training that it was made for, once that is done."
         )
-
-
-def _data_set(folder: str | None, config: Mapping[str, Any]) -> Manifest:
-    """Return the data set asked for, or that of the training, which is made anew where the training would make it."""
-    if folder is None and (config.get("generate") or {}).get("when_missing"):
-        provide_data(config)
-    return load_manifest(data_folder(folder, config))
 
 
 def _evaluate(model: LoadedModel, manifest: Manifest, protocol: Protocol, config: Mapping[str, Any]) -> Evaluation:

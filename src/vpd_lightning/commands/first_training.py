@@ -23,7 +23,7 @@ from vpd_lightning.loading import simulator_weights
 from vpd_lightning.system import AbstractSystem
 from vpd_lightning.training.callbacks.time_budget import FILE as TIME_FILE
 from vpd_lightning.training.callbacks.time_budget import TimeBudget
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 from vpd_lightning.training.checkpoints import find_resume
 
 DONE_FILE = "done.json"

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from vpd_lightning.commands.report_errors import run_command
@@ -27,28 +26,25 @@ def _run(words: list[str]) -> int:
 def _render(config: Mapping[str, Any]) -> None:
     import torch
 
-    from vpd_lightning.commands.eval import data_folder, set_threads
+    from vpd_lightning.commands.eval import set_threads
+    from vpd_lightning.commands.one_recording import choose_trajectory, data_set, load_particle_simulator
     from vpd_lightning.commands.progress import show_progress
-    from vpd_lightning.data.manifest import file_sha256, load_manifest
+    from vpd_lightning.data.manifest import file_sha256
+    from vpd_lightning.editing.colored_editor import colored_editor
+    from vpd_lightning.editing.edit_files import load_edit, replay
     from vpd_lightning.errors import OutOfMemoryError
     from vpd_lightning.evaluation import filming
     from vpd_lightning.evaluation.clip import encode_clip
     from vpd_lightning.evaluation.viewpoints import choose_viewpoints, resize_viewpoints
     from vpd_lightning.export.nerfstudio_paths import write_camera_path
     from vpd_lightning.export.output_folder import OutputFolder, beside_checkpoint, choose_folder
-    from vpd_lightning.loading import load_model
-    from vpd_lightning.simulator import Simulator
 
     _check(config)
     set_threads(config["num_threads"])
-    model = load_model(config["ckpt"], config["device"], config["change"], sleeping=config["sleeping"])
-    if not isinstance(model.simulator, Simulator):
-        raise ConfigError(
-            f"{model.path} predicts the videos of its own cameras and knows no others: there is nothing to film.\n"
-            "vpd-eval shows its predictions beside the truth."
-        )
-    manifest = load_manifest(data_folder(config["data"]["folder"], model.config))
-    path = _choose_trajectory(manifest.split(config["split"]), config)
+    operations = load_edit(config["edit"]) if config["edit"] is not None else []
+    model = load_particle_simulator(config)
+    manifest = data_set(config["data"]["folder"], model.config)
+    path = choose_trajectory(manifest, config["split"], config["trajectory"])
     start, freeze_step = config["start_frame"], config["freeze_step"]
     clip = filming.read_context(path, start)
     num_frames = (config["num_views"] if freeze_step is not None else None) or config["num_steps"] + 1
@@ -63,6 +59,9 @@ def _render(config: Mapping[str, Any]) -> None:
         try:
             with show_progress() as progress:
                 scene = encode_clip(model.simulator, clip, model.input_views)
+                if operations:
+                    viewpoint = clip.cameras.cam_to_world[1, :, :3, 3].mean(0)
+                    scene = replay(colored_editor(model.simulator, scene, viewpoint), operations).scene
                 states = filming.predict(model.simulator, scene, config["num_steps"], freeze_step)
                 filmed = filming.film(model.simulator, list(states.values()), viewpoints, progress)
         except torch.OutOfMemoryError as error:
@@ -70,7 +69,7 @@ def _render(config: Mapping[str, Any]) -> None:
                 "The device ran out of memory while rendering.\nLower height and width, or use device=cpu."
             ) from error
         truth = None
-        if viewpoints.views is not None:
+        if viewpoints.views is not None and not operations:  # of an edited scene there is no truth
             truth = filming.recorded_frames(path, start, list(states), viewpoints.views)
         filming.write_films(partial, viewpoints, filmed, truth, config["fps"], config["save_maps"])
         if freeze_step is not None:
@@ -85,6 +84,7 @@ def _render(config: Mapping[str, Any]) -> None:
                 "data": str(manifest.folder),
                 "trajectory": manifest.relative(path),
                 "start_frame": start,
+                "edit": config["edit"],
                 "num_steps": max(states),
                 "freeze_step": freeze_step,
                 "camera": config["camera"],
@@ -106,7 +106,7 @@ def _check(config: Mapping[str, Any]) -> None:
     from vpd_lightning.evaluation.filmed_maps import MAPS
     from vpd_lightning.evaluation.filming import PARTICLE_FORMATS
 
-    for name, lowest in (("num_steps", 1), ("start_frame", 0), ("trajectory", 0)):
+    for name, lowest in (("num_steps", 1), ("start_frame", 0)):
         if config[name] < lowest:
             raise ConfigError(f"{name}={config[name]} is out of range.\nAllowed: {lowest} or more.")
     for name in ("height", "width"):
@@ -131,15 +131,6 @@ def _check(config: Mapping[str, Any]) -> None:
         if unknown or len(set(config[name])) < len(config[name]):
             said = repr(unknown[0]) if unknown else "a word twice"
             raise ConfigError(f"{name} has {said}.\nAllowed: {', '.join(allowed)}, or [] for none.")
-
-
-def _choose_trajectory(paths: Sequence[Path], config: Mapping[str, Any]) -> Path:
-    if config["trajectory"] >= len(paths):
-        raise ConfigError(
-            f"There is no trajectory {config['trajectory']} in split {config['split']}.\n"
-            f"It has {len(paths)} (0 to {len(paths) - 1})."
-        )
-    return paths[config["trajectory"]]
 
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ def has_checkpoint(folder: Path) -> bool:
 
 def has_own_checkpoint(folder: Path) -> bool:
     """Whether the training that writes to this very folder has saved a checkpoint."""
-    from vpd_lightning.training.checkpoint_io import LAST, PREVIOUS
+    from vpd_lightning.training.checkpoint_files import LAST, PREVIOUS
     from vpd_lightning.training.checkpoints import FOLDER
 
     return any((folder / FOLDER / name).is_file() for name in (LAST, PREVIOUS))

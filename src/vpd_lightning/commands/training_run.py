@@ -31,7 +31,8 @@ from vpd_lightning.errors import ConfigError
 from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.randomness import derive_seed
 from vpd_lightning.system import AbstractSystem
-from vpd_lightning.training.checkpoint_io import LAST, AtomicCheckpointIO
+from vpd_lightning.training.checkpoint_files import LAST
+from vpd_lightning.training.checkpoint_io import AtomicCheckpointIO
 from vpd_lightning.training.checkpoints import FOLDER as CHECKPOINTS
 from vpd_lightning.training.checkpoints import find_resume
 from vpd_lightning.training.module import VPDModule

@@ -24,6 +24,7 @@ from vpd_lightning.config.schema import (
     ExportConfig,
     RenderConfig,
     TrainConfig,
+    ViewConfig,
     check_scene,
     check_training,
 )
@@ -33,6 +34,7 @@ SCHEMAS: dict[str, type] = {
     "train": TrainConfig,
     "eval": EvalConfig,
     "render": RenderConfig,
+    "view": ViewConfig,
     "bench": BenchConfig,
     "export": ExportConfig,
 }

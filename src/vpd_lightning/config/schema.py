@@ -156,6 +156,7 @@ class RenderConfig:
     split: str = MISSING
     trajectory: int = MISSING
     start_frame: int = MISSING
+    edit: str | None = None
     num_steps: int = MISSING
     freeze_step: int | None = None
     camera: Any = MISSING
@@ -167,6 +168,24 @@ class RenderConfig:
     save_particles: list[str] = MISSING
     save_maps: list[str] = MISSING
     save_camera_path: bool = MISSING
+    device: str = MISSING
+    num_threads: int | None = None
+    debug: bool = MISSING
+
+
+@dataclass
+class ViewConfig:
+    """Root of ``vpd-view``."""
+
+    ckpt: str = MISSING
+    change: Any = None
+    sleeping: bool = MISSING
+    data: DataChoice = MISSING
+    split: str = MISSING
+    trajectory: int = MISSING
+    start_frame: int = MISSING
+    num_steps: int = MISSING
+    port: int = MISSING
     device: str = MISSING
     num_threads: int | None = None
     debug: bool = MISSING

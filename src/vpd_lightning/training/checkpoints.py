@@ -4,7 +4,7 @@ import logging
 from pathlib import Path
 
 from vpd_lightning.errors import CheckpointError
-from vpd_lightning.training.checkpoint_io import LAST, PREVIOUS, load_checkpoint
+from vpd_lightning.training.checkpoint_files import LAST, PREVIOUS, load_checkpoint
 
 FOLDER = "checkpoints"
 FIRST_TRAINING = "pretraining"

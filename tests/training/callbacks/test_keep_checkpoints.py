@@ -10,7 +10,7 @@ import torch
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import tiny_data, tiny_module, tiny_trainer
 from vpd_lightning.training.callbacks.keep_checkpoints import KeepCheckpoints
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from tests.data.recordings import write_recordings
 from tests.training.tiny_training import tiny_data, tiny_module, tiny_trainer
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.training.callbacks.time_budget import FILE, TimeBudget
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 SECONDS_A_STEP = 2.0
 

@@ -7,7 +7,7 @@ from typing import Any
 import lightning.pytorch as pl
 from lightning.pytorch.callbacks import Checkpoint
 
-from vpd_lightning.training.checkpoint_io import BEST, LAST
+from vpd_lightning.training.checkpoint_files import BEST, LAST
 from vpd_lightning.training.checkpoints import FOLDER
 from vpd_lightning.training.module import BEST_METRIC
 

@@ -12,7 +12,7 @@ import torch
 from lightning.pytorch.callbacks import Checkpoint
 
 from vpd_lightning.training.callbacks.keep_checkpoints import save_checkpoint
-from vpd_lightning.training.checkpoint_io import LAST
+from vpd_lightning.training.checkpoint_files import LAST
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 

@@ -1,0 +1,76 @@
+"""``vpd-view``: watch and edit a prediction in the browser."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from vpd_lightning.commands.report_errors import run_command
+from vpd_lightning.errors import ConfigError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of the console command; returns the exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    return run_command(lambda: _run(words))
+
+
+def _run(words: list[str]) -> int:
+    from vpd_lightning.commands.hydra_application import configure
+
+    config = configure("view", words)
+    if config is not None:
+        viewer = start(config)
+        try:
+            viewer.server.sleep_forever()
+        finally:
+            viewer.stop()
+    return 0
+
+
+def start(config: Mapping[str, Any]) -> Any:
+    """Start the viewer that a configuration of ``vpd-view`` describes, print its address, and return it.
+
+    Raises:
+        ConfigError: viser is missing, the port is taken, or a value is out of range.
+        VPDError: whatever is wrong with the checkpoint or the data.
+    """
+    _check(config)
+    try:
+        import viser  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"vpd-view needs {error.name}, which is not installed.\npip install 'vpd-lightning[viewer]'"
+        ) from error
+    from vpd_lightning.commands.eval import set_threads
+    from vpd_lightning.commands.one_recording import choose_trajectory, data_set, load_particle_simulator
+    from vpd_lightning.export.output_folder import beside_checkpoint
+    from vpd_lightning.viewer.guard import HOST, new_token, require_free
+    from vpd_lightning.viewer.opened_scene import open_scene
+    from vpd_lightning.viewer.server import Viewer
+
+    require_free(config["port"])  # before the work
+    set_threads(config["num_threads"])
+    model = load_particle_simulator(config)
+    manifest = data_set(config["data"]["folder"], model.config)
+    path = choose_trajectory(manifest, config["split"], config["trajectory"])
+    start_frame = config["start_frame"]
+    title = f"{model.name}, {manifest.relative(path)}, frame {start_frame}"
+    opened = open_scene(model.simulator, path, start_frame, model.input_views, title)
+    folder = beside_checkpoint(model.path, "view")
+    viewer = Viewer(opened, folder, config["port"], new_token(), config["num_steps"])
+    print(f"{title}: open\n\n  {viewer.url}\n")
+    print(f"From another machine: ssh -L {viewer.port}:{HOST}:{viewer.port} THIS_MACHINE, then open the same address.")
+    print("Ctrl-C ends it.", flush=True)
+    return viewer
+
+
+def _check(config: Mapping[str, Any]) -> None:
+    for name, lowest, highest in (("num_steps", 1, 1000), ("start_frame", 0, None), ("port", 0, 65535)):
+        value = config[name]
+        if value < lowest or (highest is not None and value > highest):
+            allowed = f"{lowest} or more" if highest is None else f"{lowest} to {highest}"
+            raise ConfigError(f"{name}={value} is out of range.\nAllowed: {allowed}.")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
