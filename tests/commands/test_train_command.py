@@ -180,6 +180,15 @@ def test_configuration_can_be_shown_without_a_run(capsys: pytest.CaptureFixture[
     assert not list(in_folder.iterdir())
 
 
+@pytest.mark.parametrize(
+    "line", ["experiment=tiny --cfg job -p renderer seed=1", "-p renderer experiment=tiny --cfg job"]
+)
+def test_flags_may_stand_anywhere_among_the_settings(line: str, capsys: pytest.CaptureFixture[str]):
+    assert train.main(line.split()) == 0
+
+    assert yaml.safe_load(capsys.readouterr().out.partition("\n")[2])["near"] == "${scene.near}"  # behind "# @package"
+
+
 @pytest.mark.slow
 def test_help_needs_neither_torch_nor_three_seconds(tmp_path: Path):
     code = (

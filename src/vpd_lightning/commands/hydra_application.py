@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from vpd_lightning.errors import ConfigError
@@ -60,7 +61,9 @@ def parse_arguments(argv: Sequence[str]) -> Arguments:
             is_multirun = True
         elif name in _QUESTIONS:
             is_question = True
-        elif name not in ("--resolve", "--run", "-r", "--package", "-p"):
+        elif name in ("--package", "-p"):
+            flags += [] if value else [*islice(words, 1)]
+        elif name not in ("--resolve", "--run", "-r"):
             raise ConfigError(f"there is no flag {name}.\nSettings are written key=value; --help shows examples.")
     return Arguments(overrides, flags, config_dir, is_multirun, is_question)
 
@@ -109,7 +112,10 @@ def run_hydra(command: str, argv: Sequence[str], task: Callable[[Any], Any]) -> 
     from vpd_lightning.config.composing import plugin_search_path, prepare
 
     prepare()
-    with _command_line(f"vpd-{command}", [*argv, *plugin_search_path(argv)]):
+    # Hydra's parser takes settings in one run of words only, and plug-ins add one: flags go in front.
+    arguments = parse_arguments(argv)
+    words = [*arguments.flags, *arguments.overrides, *plugin_search_path(arguments.overrides)]
+    with _command_line(f"vpd-{command}", words):
         try:
             hydra.main(config_path=str(config_folder()), config_name=command, version_base="1.3")(task)()
         except SystemExit as stop:
