@@ -1,19 +1,14 @@
 """Every encoder, dynamics, renderer and loss of conf/ keeps its contract; a new file is tested because it is there."""
 
-import re
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from importlib import import_module
-from importlib.metadata import EntryPoint
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from vpd_lightning.config import build, compose, config_folder, load_plugins
+from vpd_lightning.config import build, compose, config_folder
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.persistence import PersistenceDynamics
 from vpd_lightning.encoder.base import AbstractEncoder
@@ -364,31 +359,3 @@ def test_only_checks_that_allow_it_can_be_departed_from(name: str) -> None:
 def test_contract_without_build_says_what_to_do() -> None:
     with pytest.raises(NotImplementedError, match="must define build"):
         EncoderContract().test_inputs_stay_as_they_are()
-
-
-GUIDE = Path(__file__).parents[1] / "docs" / "adding_a_component.md"
-# A file of the guide: its path in backquotes on a line of its own, then its content.
-LISTED_FILE = re.compile(r"^`([\w./]+)`\n\n```\w+\n(.*?)^```", re.MULTILINE | re.DOTALL)
-
-
-def test_example_of_the_guide_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = dict(LISTED_FILE.findall(GUIDE.read_text()))
-    for name, content in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(content)
-    assert 'plugins"]\nmy_lab = "my_lab"' in files["pyproject.toml"]
-    monkeypatch.syspath_prepend(tmp_path / "src")
-    monkeypatch.syspath_prepend(tmp_path / "tests")
-    entry = EntryPoint("my_lab", "my_lab", "vpd_lightning.plugins")
-    monkeypatch.setattr("vpd_lightning.config.plugins.entry_points", lambda group: [entry])
-    load_plugins.cache_clear()
-    try:
-        section = compose("train", ["experiment=tiny", "dynamics=drift"])["dynamics"]
-        assert type(build(section, AbstractDynamics, "dynamics")).__name__ == "DriftDynamics"
-        contract = import_module("test_drift").TestDrift()
-        for name in checks(contract):
-            getattr(contract, name)()
-    finally:
-        load_plugins.cache_clear()
-        for name in [name for name in sys.modules if name.partition(".")[0] in ("my_lab", "test_drift")]:
-            del sys.modules[name]
