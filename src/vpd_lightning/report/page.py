@@ -113,7 +113,7 @@ def _board(board: Board, files: BoardFiles) -> list[str]:
         lines += ["### Paired differences", "", words, "", *paired, ""]
     settings = settings_table(board)
     if settings:
-        lines += ["### Settings", "", *settings, "", "All that differs:", *settings_lists(board), ""]
+        lines += ["### Settings", "", *settings, "", "All that differs:", "", *settings_lists(board), ""]
     for sweep, path in files.sweeps:
         lines += [_picture(f"scores over {sweep.title}", path), ""]
         lines += [f"Not drawn: {row.name}, whose data set is not there to count." for row in sweep.not_placed]
