@@ -20,7 +20,7 @@ STAMP := $(VENV)/.installed
 export MPLBACKEND = Agg
 
 .PHONY: audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
-	types imports cluster bench stability paper-step wheel clean
+	types imports docs cluster bench stability paper-step wheel clean
 
 help: ## List the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -85,6 +85,9 @@ types: $(STAMP) ## Check the type annotations
 imports: $(STAMP) ## Check that imports point one way (contracts in pyproject.toml)
 	$(BIN)/lint-imports
 
+docs: $(STAMP) ## Build the pages of docs/ as a site into site/ (open site/index.html); a warning fails it
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 cluster: $(STAMP) ## Build and install torch-cluster (needs a C++ compiler; 10 to 20 minutes on two cores)
 	$(BIN)/python -m pip install -c constraints.txt setuptools wheel
 	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation torch-cluster==1.6.3
@@ -120,5 +123,5 @@ wheel: $(STAMP) ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel
 
 clean: ## Remove caches and build products; runs, data sets and .venv stay
-	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -print0 | xargs -0 rm -rf
