@@ -4,7 +4,7 @@
 ``vpd-eval`` leave them. Each cell is the mean over seeds with the least and the greatest. References are those of the
 first seed; they are the same for all. Centroid errors (``step N``) and Chamfer distance are in centimetres; ``size 32``
 is a rigid body's size after 32 steps over its first, ``rest`` the share of bodies that come to rest within 5 cm of
-their true height.
+their true height, ``seconds`` what an update took by the training's clock. ``--columns`` chooses others than usual.
 """
 
 import argparse
@@ -21,11 +21,11 @@ STEPS = (1, 4, 8, 16, 32)
 MIN_AT_REST = 5  # bodies, below which a share says nothing
 REFERENCES = {"copy_last": "*last frame*", "train_mean": "*mean image*"}
 CENTROIDS = {"constant": "*best constant*", "velocity": "*first velocity kept*"}
-HEADER = [
-    "data set", "system", "updates", "PSNR", "PSNR moving", *(f"step {step}" for step in STEPS),
-    "Chamfer", "size 32", "rest",
-]  # fmt: skip
-FORMS = {"updates": ".0f", "PSNR": ".2f", "PSNR moving": ".2f", "size 32": ".2f", "rest": ".0%"}
+COLUMNS = ("updates", "PSNR", "PSNR moving", *(f"step {step}" for step in STEPS), "Chamfer", "size 32", "rest")
+FORMS = {
+    "updates": ".0f", "seconds": ".2f", "PSNR": ".2f", "PSNR moving": ".2f", "SSIM": ".3f", "size 32": ".2f",
+    "rest": ".0%",
+}  # fmt: skip
 
 
 def read_runs(folder: Path) -> dict[str, dict[str, dict[int, Metrics]]]:
@@ -55,7 +55,10 @@ def numbers_of(metrics: Metrics) -> dict[str, float | None]:
     sizes = metrics["motion"].get("size_ratio", {}).get("per_step")
     rest = metrics.get("events", {}).get("rest", {})
     shown |= {f"step {step}": 100 * errors[step - 1] for step in STEPS}
+    spent = metrics.get("training", {}).get("seconds")
     return shown | {
+        "seconds": None if spent is None or not metrics["step"] else spent / metrics["step"],
+        "SSIM": metrics.get("ssim", {}).get("mean"),
         "size 32": sizes[31] if sizes else None,
         "rest": rest.get("share_within_5_cm") if rest.get("count", 0) >= MIN_AT_REST else None,
     }
@@ -67,23 +70,24 @@ def references_of(metrics: Metrics) -> dict[str, dict[str, float | None]]:
     for key, name in REFERENCES.items():
         values = metrics["references"][key]
         rows[name] = {"PSNR": values["psnr"]["mean"], "PSNR moving": values["psnr_moving"]["mean"]}
+        rows[name] |= {"SSIM": values["ssim"]["mean"]} if "ssim" in values else {}
     for key, name in CENTROIDS.items():
         errors = metrics["motion"][f"centroid_error_{key}"]["per_step"]
         rows[name] = {f"step {step}": 100 * errors[step - 1] for step in STEPS}
     return rows
 
 
-def table(runs: dict[str, dict[str, dict[int, Metrics]]]) -> str:
+def table(runs: dict[str, dict[str, dict[int, Metrics]]], columns: Sequence[str] = COLUMNS) -> str:
     """Return the Markdown table."""
-    lines = ["| " + " | ".join(HEADER) + " |", "|---|---|" + "---:|" * (len(HEADER) - 2)]
+    lines = ["| " + " | ".join(["data set", "system", *columns]) + " |", "|---|---|" + "---:|" * len(columns)]
     for experiment, systems in runs.items():
         for system, seeds in systems.items():
             each = [numbers_of(metrics) for metrics in seeds.values()]
-            cells = [_spread([numbers[name] for numbers in each], name) for name in HEADER[2:]]
+            cells = [_spread([numbers[name] for numbers in each], name) for name in columns]
             lines.append(f"| {experiment} | {system} | " + " | ".join(cells) + " |")
         first = next(iter(next(iter(systems.values())).values()))
         for name, numbers in references_of(first).items():
-            cells = [_spread([numbers[key]], key) if key in numbers else "" for key in HEADER[2:]]
+            cells = [_spread([numbers[key]], key) if key in numbers else "" for key in columns]
             lines.append(f"| | {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -102,9 +106,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, help="JSON file of the numbers of every run")
+    names = sorted({*COLUMNS, *FORMS})
+    parser.add_argument("--columns", nargs="+", default=COLUMNS, choices=names, metavar="COLUMN", help=", ".join(names))
     options = parser.parse_args(arguments)
     runs = read_runs(options.folder)
-    print(table(runs))
+    print(table(runs, options.columns))
     if options.out:
         content = {
             experiment: {

@@ -11,6 +11,8 @@ def metrics(psnr, errors):
     motion |= {f"centroid_error{kind}": {"per_step": list(errors)} for kind in ("", "_constant", "_velocity")}
     return {
         "step": 100,
+        "training": {"seconds": 45.0},
+        "ssim": {"mean": 0.75},
         "psnr": {"mean": psnr},
         "psnr_moving": {"mean": psnr - 5},
         "chamfer": {"mean": 0.031},
@@ -40,14 +42,23 @@ def test_a_cell_is_the_mean_over_seeds_with_its_range(runs):
     assert row.endswith("| 3.1 [3.1, 3.1] | 1.25 [1.25, 1.25] | 75% [75%, 75%] |")
 
 
+def test_columns_can_be_chosen(runs, capsys):
+    main([str(runs), "--columns", "seconds", "SSIM", "step 32"])
+
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "| data set | system | seconds | SSIM | step 32 |"
+    assert lines[2] == "| block | inertial_gnn | 0.45 [0.45, 0.45] | 0.750 [0.750, 0.750] | 32.5 [32.0, 33.0] |"
+
+
 def test_what_was_not_measured_is_left_open():
     found = metrics(22.0, range(32))
-    del found["motion"]["size_ratio"]
+    del found["motion"]["size_ratio"], found["ssim"]
+    found["training"]["seconds"] = None
     found["events"]["rest"]["count"] = 1
 
     numbers = numbers_of(found)
 
-    assert numbers["size 32"] is None and numbers["rest"] is None
+    assert [numbers[name] for name in ("size 32", "rest", "SSIM", "seconds")] == [None] * 4
 
 
 def test_references_and_numbers_of_every_run_are_kept(runs, tmp_path, capsys):
