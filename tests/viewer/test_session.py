@@ -1,0 +1,187 @@
+"""What the viewer does, without a browser."""
+
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("viser")
+
+import trimesh
+
+import vpd_lightning as vpd
+from tests.editing.scenes import same
+from tests.viewer.opened import open_tossed_box
+from vpd_lightning.editing.edit_files import load_edit, replay
+from vpd_lightning.editing.operations import Delete, Duplicate, Move
+from vpd_lightning.editing.selectors import Box, Everything
+from vpd_lightning.errors import EditError
+from vpd_lightning.export.camera_paths import read_camera_file
+from vpd_lightning.viewer.exports import ExportFolder
+from vpd_lightning.viewer.opened_scene import OpenedScene
+from vpd_lightning.viewer.progressive_view import ProgressiveView, Request, Viewpoint
+from vpd_lightning.viewer.session import Session
+
+LEFT = Box([-9, -9, -9], [0, 9, 9])
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
+    return open_tossed_box(tmp_path_factory.mktemp("session"))
+
+
+def test_simulating_is_the_rollout_of_the_edited_scene(opened: OpenedScene) -> None:
+    session, shown = Session(opened), []
+    session.apply(Delete(LEFT))
+    assert session.simulate(3, shown.append) and shown == [1, 2, 3]
+    states = opened.simulator.rollout(vpd.SceneEditor(opened.scene).delete(LEFT).scene, 3)
+    for one, other in zip(session.now.states[1:], states, strict=True):
+        assert torch.equal(one.positions, other.positions) and torch.equal(one.mask, other.mask)
+    session.apply(Move(Everything(), (0.0, 0.0, 0.1)))
+    assert session.now.num_steps == 0  # what was simulated is of another scene
+
+
+def test_an_edit_in_between_ends_a_simulation(opened: OpenedScene) -> None:
+    session = Session(opened)
+
+    def edit(step: int) -> None:
+        if step == 2:
+            session.apply(Delete(LEFT))
+
+    assert not session.simulate(5, edit)
+    assert session.now.num_steps == 0
+
+
+def test_two_sessions_do_not_mix(opened: OpenedScene) -> None:
+    one, other = Session(opened), Session(opened)
+    one.apply(Delete(LEFT))
+    other.apply(Duplicate(LEFT, (0.0, 1.0, 0.0)))
+    assert [type(o).__name__ for o in one.operations()] == ["Delete"]
+    assert [type(o).__name__ for o in other.operations()] == ["Duplicate"]
+    other.undo()
+    assert same(other.now.editor.scene, opened.scene) and not same(one.now.editor.scene, opened.scene)
+    with pytest.raises(EditError, match="nothing to undo"):
+        other.undo()
+
+
+def test_selections_combine_as_sets(opened: OpenedScene) -> None:
+    session = Session(opened)
+    total, left = session.select(Everything()), session.select(LEFT)
+    assert session.select(~LEFT, "add") == total
+    assert session.select(LEFT, "subtract") == total - left
+    assert session.select(LEFT, "intersect") == 0
+    with pytest.raises(EditError, match="Nothing is selected"):
+        session.need_selection()
+    assert session.select(LEFT, "add") == left
+    assert session.select(None) == 0
+
+
+def test_a_kept_scene_stands_beside_and_is_swapped(opened: OpenedScene) -> None:
+    session = Session(opened)
+    with pytest.raises(EditError, match="Nothing is kept"):
+        session.swap()
+    session.keep()
+    session.apply(Delete(LEFT))
+    session.simulate(2)
+    assert int(session.shown(2, of_kept=True)[0].mask.sum()) > int(session.shown(2)[0].mask.sum())
+    session.swap()
+    assert session.operations() == [] and session.kept.num_steps == 2
+
+
+def test_figures_compare_with_the_recording_as_far_as_it_goes(opened: OpenedScene) -> None:
+    session = Session(opened)
+    last = opened.num_true_steps
+    session.simulate(last + 1)
+    image = session.render(0, opened.cameras[:1])[0]
+    figures = session.measure(0, 0, image)
+    assert 5 < figures["psnr"] < 60 and 0 < figures["chamfer"] < 0.5
+    assert session.measure(0, 0, opened.truth[0, 0])["psnr"] == float("inf")
+    assert set(session.measure(last + 1, 0, image)) == {"particles"}
+    points, colors = opened.seen_points(0)
+    assert len(points) == len(colors) > 100
+    assert (points >= np.array(opened.workspace_min) - 1e-6).all() and (points <= np.array(opened.workspace_max)).all()
+
+
+class Shown:
+    def __init__(self) -> None:
+        self.pictures: list[tuple[np.ndarray, bool]] = []
+        self.event = threading.Event()
+
+    def __call__(self, image: np.ndarray, is_full: bool) -> None:
+        self.pictures.append((image, is_full))
+        if is_full:
+            self.event.set()
+
+
+def viewpoint(opened: OpenedScene, aspect: float = 1.0) -> Viewpoint:
+    return Viewpoint(opened.cameras.cam_to_world[0].double().numpy(), 0.8, aspect)
+
+
+def test_a_coarse_picture_comes_first_and_the_full_one_is_that_of_the_simulator(opened: OpenedScene) -> None:
+    shown, state = Shown(), opened.scene.current
+    view = ProgressiveView(opened.simulator.renderer, shown)
+    view._pixels_per_second = 1.0  # a slow machine
+    try:
+        view.ask(Request([state], viewpoint(opened, 1.5), 40))
+        assert shown.event.wait(60)
+    finally:
+        view.stop()
+    (coarse, is_coarse_full), (full, is_full) = shown.pictures
+    assert coarse.shape == (24, 36, 3) and not is_coarse_full
+    assert full.shape == (40, 60, 3) and is_full
+    whole = opened.simulator.render([state], viewpoint(opened, 1.5).cameras(40))[0, 0]
+    assert np.abs(full.astype(int) - (whole * 255).round().numpy().astype(int)).max() <= 1  # bands: other sums
+
+
+def test_what_is_out_of_date_is_not_finished(opened: OpenedScene) -> None:
+    shown, state = Shown(), opened.scene.current
+    view = ProgressiveView(opened.simulator.renderer, shown)
+    view._pixels_per_second = 1.0
+    try:
+        for _ in range(5):
+            view.ask(Request([state], viewpoint(opened), 64))
+            time.sleep(0.02)
+        view.ask(Request([state, state], viewpoint(opened), 32))  # two scenes side by side
+        assert shown.event.wait(60)
+    finally:
+        view.stop()
+    full = [image for image, is_full in shown.pictures if is_full]
+    assert [image.shape for image in full] == [(32, 32, 3)]
+    assert np.array_equal(full[0][:, :16], full[0][:, 16:])
+
+
+def test_exports_are_read_again_identically(opened: OpenedScene, tmp_path: Path) -> None:
+    session, folder = Session(opened), ExportFolder(tmp_path / "view")
+    session.apply(Delete(LEFT))
+    session.simulate(3)
+    state, colors = session.shown(2)
+    there = state.mask[0].numpy()
+    for suffix in ("ply", "glb"):
+        path = folder.particles(state, colors, suffix)
+        loaded = trimesh.load(path)
+        cloud = next(iter(loaded.geometry.values())) if suffix == "glb" else loaded
+        assert np.array_equal(np.asarray(cloud.vertices, np.float32), state.positions[0].numpy()[there])
+        assert np.array_equal(np.asarray(cloud.colors)[:, :3], colors[there])
+    with np.load(folder.particles(state, colors, "npz")) as arrays:
+        assert np.array_equal(arrays["features"], state.features[0].numpy()[there])
+    assert folder.particles(state, colors, "ply").name == "particles_002.ply"  # nothing is written over
+
+    frames = np.stack([session.render(step, opened.cameras[:1])[0] for step in range(4)])
+    film = cv2.VideoCapture(str(folder.film(frames, 10.0)))
+    count = 0
+    while film.read()[0]:
+        count += 1
+    assert count == 4
+
+    assert same(replay(opened.scene, load_edit(folder.edit(session.operations()))).scene, session.now.editor.scene)
+    with pytest.raises(EditError, match="Nothing was edited"):
+        folder.edit([])
+    cameras = viewpoint(opened, 1.5).cameras(48)
+    read, moving = read_camera_file(folder.camera_path(cameras, 10.0))
+    assert moving and (read.height, read.width) == (48, 72)
+    assert torch.allclose(read.cam_to_world, cameras.cam_to_world, atol=1e-5)
+    assert torch.allclose(read.intrinsics, cameras.intrinsics, atol=1e-3)
