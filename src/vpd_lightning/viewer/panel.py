@@ -30,6 +30,7 @@ class Panel:
         self.view = ProgressiveView(opened.simulator.renderer, self._show_picture)
         self._playing, self._closed = threading.Event(), threading.Event()
         self._busy = threading.Lock()
+        self._looks_through: int | None = None
         gui: Any = client.gui
         gui.configure_theme(show_share_button=False, control_width="medium")
         gui.add_markdown(f"**{opened.title}**")
@@ -71,7 +72,11 @@ class Panel:
         )
         for handle in (self.mode, self.rows, self.point_size, self.cameras_shown, self.truth_shown):
             handle.on_update(lambda _: self.redraw())
-        look.on_update(lambda _: self.look_through(int(look.value)))
+
+        @look.on_update
+        def _(_: Any) -> None:
+            self.look_through(int(look.value))
+            self.redraw()
 
     def _add_truth_tab(self) -> None:
         gui: Any = self.client.gui
@@ -165,7 +170,7 @@ class Panel:
         step = int(self.step.value)
         with_points = self.mode.value != "rendered"
         self.drawing.particles(step, with_points, self.point_size.value / 100)
-        self.drawing.cameras(self.cameras_shown.value)
+        self.drawing.cameras(self.cameras_shown.value, self._looks_through)
         self.drawing.measured(step if self.truth_shown.value else None, self.point_size.value / 100)
         self.ask_picture()
         if not self._playing.is_set():
@@ -210,6 +215,7 @@ class Panel:
     def look_through(self, view: int) -> None:
         """Put the browser's camera where a recorded one is."""
         cameras, camera = self.opened.cameras, self.client.camera
+        self._looks_through = view
         pose = cameras.cam_to_world[view].double().numpy()
         camera.position = pose[:3, 3]
         camera.look_at = pose[:3, 3] + pose[:3, 2] * np.linalg.norm(self.opened.target - pose[:3, 3])

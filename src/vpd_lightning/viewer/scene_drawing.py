@@ -38,13 +38,13 @@ class SceneDrawing:
         points = self.session.now.states[0].positions[0].float().cpu().numpy()[chosen]
         self._cloud("selected", points, np.array(SELECTED, np.uint8), 1.3 * size, True, np.zeros(3))
 
-    def cameras(self, visible: bool) -> None:
-        """Draw the recorded cameras as frustums."""
+    def cameras(self, visible: bool, but: int | None) -> None:
+        """Draw the recorded cameras as frustums; not the one ``but``, through which the browser looks."""
         cameras = self.session.opened.cameras
         for view in range(len(cameras.intrinsics)):
             name = f"cameras/{view}"
             if name in self._handles:
-                self._handles[name].visible = visible
+                self._handles[name].visible = visible and view != but
                 continue
             pose = cameras.cam_to_world[view].double().numpy()
             height, width = cameras.height, cameras.width
@@ -62,7 +62,7 @@ class SceneDrawing:
                 color=(40, 110, 220) if is_input else (150, 150, 150),
                 wxyz=_wxyz(pose[:3, :3]),
                 position=pose[:3, 3],
-                visible=visible,
+                visible=visible and view != but,
             )
 
     def measured(self, step: int | None, size: float) -> None:
