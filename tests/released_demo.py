@@ -16,7 +16,5 @@ def demo_model() -> LoadedModel:
 
 def make_demo_data(folder: Path) -> Path:
     """Write one recording of each split and return the data set's folder."""
-    generate(
-        scene="mujoco_block", preset="demo", out=folder, seed=0, overrides=["splits={train: 1, validation: 1, test: 1}"]
-    )
-    return folder
+    sizes = {"splits.train": 1, "splits.validation": 1, "splits.test": 1}
+    return generate("mujoco_block", "demo", out=folder, seed=0, renderer="raycast", workers=1, overrides=sizes)

@@ -101,7 +101,7 @@ class Particles(_Border):
 
     def without_padding(self) -> "Particles":
         """Return the same particles with zeros in padding: NaN there would survive a product with zero."""
-        if self.mask.device.type == "cpu" and not _is_traced() and bool(self.mask.all()):
+        if self.mask.device.type == "cpu" and not is_traced() and bool(self.mask.all()):
             return self
         names = ("positions", "features", "colors", "normals")
         known = {name: value for name in names if (value := getattr(self, name)) is not None}
@@ -116,7 +116,7 @@ def require_finite(where: str, **inputs: Tensor) -> None:
     Raises:
         NonFiniteError: naming every input that is not finite.
     """
-    if _is_traced():
+    if is_traced():
         return
     finite = torch.stack([torch.isfinite(tensor).all() for tensor in inputs.values()])
     if bool(finite.all()):
@@ -128,7 +128,7 @@ def require_finite(where: str, **inputs: Tensor) -> None:
     )
 
 
-def _is_traced() -> bool:
+def is_traced() -> bool:
     """Whether what runs is being recorded, so that no number may be looked at."""
     return torch.compiler.is_compiling() or (torch.cuda.is_available() and torch.cuda.is_current_stream_capturing())
 

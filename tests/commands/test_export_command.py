@@ -4,11 +4,20 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests.evaluation.tossed_box import write_tossed_boxes
-from tests.released_model import write_run
+from tests.released_model import figures, write_run
 from vpd_lightning.commands import eval as evaluation
 from vpd_lightning.commands import export, info
+from vpd_lightning.evaluation.clip import encode_clip
+from vpd_lightning.evaluation.protocol import read_clip
+from vpd_lightning.geometry.cameras import pixel_rays
+from vpd_lightning.loading import load_model
+from vpd_lightning.training.checkpoint_io import write_checkpoint
+from vpd_lightning.types import Rays
+
+RELEASED = Path(__file__).parents[2] / "released" / "mujoco_block_demo"
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +54,27 @@ def test_a_run_becomes_a_folder_that_other_commands_take(
     assert "model.safetensors is damaged" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_a_release_may_hold_its_renderer_as_a_program(in_folder: Path, data: Path) -> None:
+    model = load_model(RELEASED)
+    weights = {f"simulator.{name}": value for name, value in model.simulator.state_dict().items()}
+    checkpoint = in_folder / "run" / "checkpoints" / "last.ckpt"
+    write_checkpoint({"state_dict": weights, "hyper_parameters": model.config, "global_step": 7}, checkpoint)
+    (in_folder / "run" / "evaluation").mkdir()
+    (in_folder / "run" / "evaluation" / "metrics.json").write_text(json.dumps(figures(checkpoint, data)))
+    assert export.main(["ckpt=run", "out=released/boxes", "renderer_program=100"]) == 0
+    program = torch.export.load(in_folder / "released" / "boxes" / "renderer.pt2").module()
+    simulator = load_model(in_folder / "released" / "boxes").simulator
+    clip = read_clip(data / "test" / "000000.h5", 0, 0, num_steps=0, with_state=False)
+    particles = encode_clip(simulator, clip, [0, 1]).current
+    rays = pixel_rays(clip.cameras[0, 0])
+    chosen = Rays(*(part.reshape(1, -1, 3)[:, 200:300] for part in (rays.origins, rays.directions)))
+    with torch.no_grad():
+        drawn = simulator.renderer(particles, chosen, None)
+    colors, _, _ = program(particles.positions, particles.features, particles.mask, chosen.origins, chosen.directions)
+    torch.testing.assert_close(colors, drawn.rgbs, rtol=1e-4, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
@@ -56,6 +86,8 @@ def test_a_run_becomes_a_folder_that_other_commands_take(
         (["ckpt={run}", "out=here", "max_megabytes=0.01"], 2, "max_megabytes"),
         (["ckpt={run}", "out=here", "max_megabytes=0"], 2, "out of range"),
         (["ckpt={run}", "out=here", "metric=x"], 2, "metric"),
+        (["ckpt={run}", "out=here", "renderer_program=0"], 2, "renderer_program=0"),
+        (["ckpt={run}", "out=here", "renderer_program=8"], 2, "PointNeRFRenderer cannot be exported"),
     ],
 )
 def test_bad_words_get_a_named_error(

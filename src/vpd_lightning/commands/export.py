@@ -8,6 +8,8 @@ from typing import Any
 from vpd_lightning.commands.report_errors import run_command
 from vpd_lightning.errors import ConfigError
 
+_MAX_RAYS = 65536
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console command; returns the exit code."""
@@ -33,14 +35,32 @@ def _export(config: Mapping[str, Any]) -> None:
     source, folder = Path(config["ckpt"]).expanduser(), choose_folder(config["out"], Path())
     if is_release(source):
         raise ConfigError(f"{source} is a released model already.\nGive a run folder or a checkpoint.")
+    if config["renderer_program"] is not None and not 1 <= config["renderer_program"] <= _MAX_RAYS:
+        raise ConfigError(
+            f"renderer_program={config['renderer_program']} is out of range.\nAllowed: 1 to {_MAX_RAYS} rays, or null."
+        )
     model = load_model(source)
     trained = TrainedSystem(system=model.simulator, config=model.config, checkpoint=model.path, step=model.step)
     metrics = find_metrics(trained, config["metrics"])
     with OutputFolder(folder) as partial:
+        if config["renderer_program"] is not None:  # first: it counts among the megabytes
+            _write_renderer(partial, model.simulator, config["renderer_program"])
         write_release(partial, trained, metrics, name=folder.name, max_megabytes=config["max_megabytes"])
     print(f"{model.name}, step {model.step}: {model.path}")
     print(f"{folder_bytes(folder) / 1e6:.1f} MB")
     print(folder)
+
+
+def _write_renderer(folder: Path, system: Any, num_rays: int) -> None:
+    from vpd_lightning.export.renderer_program import PROGRAM_FILE, export_renderer, write_program
+    from vpd_lightning.simulator import Simulator
+
+    num_particles = getattr(getattr(system, "encoder", None), "num_particles", None)
+    if not isinstance(system, Simulator) or num_particles is None:
+        raise ConfigError("This system has no renderer of particles to export.\nLeave renderer_program out.")
+    feature_dim = system.encoder.feature_dim
+    program = export_renderer(system.renderer, num_particles=num_particles, feature_dim=feature_dim, num_rays=num_rays)
+    write_program(folder / PROGRAM_FILE, program)
 
 
 if __name__ == "__main__":

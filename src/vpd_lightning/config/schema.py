@@ -199,6 +199,7 @@ class ExportConfig:
     out: str = MISSING
     metrics: str | None = None
     max_megabytes: float = MISSING
+    renderer_program: int | None = None
     debug: bool = MISSING
 
 

@@ -6,6 +6,7 @@ from jaxtyping import Float, Int64
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from vpd_lightning.graph.bodies import label_bodies
 from vpd_lightning.types import Particles
 
 _RANK = 4
@@ -14,8 +15,8 @@ _RANK = 4
 _LINK = 2.5
 """Two particles hang together within this many spacings."""
 
-_TONE = 0.2
-"""A difference of chromaticity that counts as much as being one link apart."""
+_BODY_LINK, _MAX_CONCAVITY, _MAX_CONCAVE_SHARE, _MAX_BODIES = 1.7, 0.15, 0.35, 64
+"""Bodies as ``conf/dynamics/inertial.yaml`` finds them, only more of them."""
 
 _MIN_PARTICLES = 8
 """Fewer particles are no cluster."""
@@ -29,12 +30,13 @@ _MIN_PLANE_WIDTH = 0.25
 """The narrower side of such a plane is at least this share of the scene's diagonal: bodies in a row are no floor."""
 
 
-def object_clusters(particles: Particles, colors: Float[Tensor, "particle 3"] | None) -> Int64[Tensor, " particle"]:
+def object_clusters(particles: Particles) -> Int64[Tensor, " particle"]:
     """Return the cluster of each particle of one frame (batch axis of 1), from 0 (most particles) on; -1 elsewhere.
 
     Scenery and what hangs together with fewer than eight particles is -1. Where an encoder told what may move, all else
-    is scenery; where none did, the widest planes are. The others are divided by DBSCAN (scikit-learn) over place and,
-    where it is known, chromaticity, which shading does not change. Bodies of one colour that touch are one cluster.
+    is scenery; where none did, the widest planes are. The others are divided into what convexly hangs together where
+    normals and colours were observed (``graph.bodies``), so that bodies which touch stay two; and else by DBSCAN
+    (scikit-learn) over places, to which bodies that touch are one.
     """
     labels = torch.full((particles.num_particles,), -1, dtype=torch.int64)
     there = particles.mask[0].cpu()
@@ -42,12 +44,15 @@ def object_clusters(particles: Particles, colors: Float[Tensor, "particle 3"] | 
     if len(where) < _MIN_PARTICLES:
         return labels.to(particles.positions.device)
     points = particles.positions[0].detach().cpu().double().numpy()[where]
-    tones = None if colors is None else _chromaticity(colors.detach().cpu().double().numpy()[where])
     known = particles.moving
     loose = ~_on_wide_planes(points) if known is None else known[0].cpu().numpy()[where]
     found = np.full(len(where), -1)
     if loose.sum() >= _MIN_PARTICLES:
-        found[loose] = _divided(points[loose], None if tones is None else tones[loose])
+        found[loose] = (
+            _divided(points[loose])
+            if particles.normals is None or particles.colors is None
+            else _bodies(particles, where[loose])
+        )
     labels[torch.from_numpy(where)] = torch.from_numpy(_by_size(found))
     return labels.to(particles.positions.device)
 
@@ -60,12 +65,31 @@ def usual_spacing(points: Float[np.ndarray, "particle 3"]) -> float:
     return max(float(np.median(cKDTree(points).query(points, k=[rank + 1])[0])), 1e-9)
 
 
-def _divided(points: np.ndarray, tones: np.ndarray | None) -> np.ndarray:
+def _bodies(particles: Particles, chosen: np.ndarray) -> np.ndarray:
+    assert particles.normals is not None and particles.colors is not None
+    index = torch.from_numpy(chosen).to(particles.positions.device)
+    positions, normals, colors = (
+        values[:, index] for values in (particles.positions, particles.normals, particles.colors)
+    )
+    mask = torch.ones_like(positions[..., 0], dtype=torch.bool)
+    found = label_bodies(
+        positions - positions[:, :1],
+        normals,
+        colors,
+        mask,
+        num_bodies=_MAX_BODIES,
+        link=_BODY_LINK,
+        max_concavity=_MAX_CONCAVITY,
+        max_concave_share=_MAX_CONCAVE_SHARE,
+    )
+    return found[0].cpu().numpy()
+
+
+def _divided(points: np.ndarray) -> np.ndarray:
     from sklearn.cluster import DBSCAN
 
     reach = _LINK * usual_spacing(points)
-    joint = points / reach if tones is None else np.concatenate([points / reach, tones / _TONE], axis=1)
-    labels = DBSCAN(eps=1.0, min_samples=_RANK).fit_predict(joint)
+    labels = DBSCAN(eps=reach, min_samples=_RANK).fit_predict(points)
     sizes = np.bincount(labels[labels >= 0], minlength=1)
     large = np.flatnonzero(sizes >= _MIN_PARTICLES)
     known = np.isin(labels, large)
@@ -113,10 +137,6 @@ def _best_plane(points: np.ndarray, tolerance: float, num_trials: int = 200) -> 
     heights = np.einsum("pi,ti->tp", points, normals) - np.einsum("ti,ti->t", triples[proper, 0], normals)[:, None]
     inside = np.abs(heights) < tolerance
     return inside[inside.sum(axis=1).argmax()]
-
-
-def _chromaticity(colors: np.ndarray) -> np.ndarray:
-    return colors / (colors.sum(axis=1, keepdims=True) + 0.15)
 
 
 def _by_size(labels: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ class EditState:
     @cached_property
     def clusters(self) -> Int64[Tensor, " particle"]:
         """The object-like cluster of each current particle, -1 for scenery (see ``object_clusters``)."""
-        return object_clusters(self.scene.current, self.colors)
+        return object_clusters(self.scene.current)
 
     @property
     def positions(self) -> Float[Tensor, "particle 3"]:
@@ -63,7 +63,7 @@ def start_state(
     for frame, given in ((scene.previous, previous_colors), (scene.current, colors)):
         if given is not None and given.shape != frame.positions.shape[1:]:
             raise EditError(f"Colours have shape {tuple(given.shape)}, positions {tuple(frame.positions.shape[1:])}.")
-    clusters = object_clusters(scene.current, colors)
+    clusters = object_clusters(scene.current)
     origin = match_frames(scene.previous, scene.current, clusters, previous_colors, colors)
     return EditState(scene, origin, colors)
 

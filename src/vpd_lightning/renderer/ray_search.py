@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vpd_lightning.renderer.precision import at_least_float32, full_precision
-from vpd_lightning.types import require_finite
+from vpd_lightning.types import is_traced, require_finite
 
 CANDIDATE_BACKENDS = ("auto", "torch", "numba")
 
@@ -78,7 +78,7 @@ class RaySearch:
             ValueError: when the backend is unknown.
         """
         positions = at_least_float32(positions.detach())
-        if not bool(valid.all()):
+        if is_traced() or not bool(valid.all()):
             positions = torch.where(valid[..., None], positions, 0.0)
         require_finite("Ray search", positions=positions)
         self.backend = resolved_backend(backend, positions.device)
@@ -169,7 +169,7 @@ def _closest_torch(
     distance = torch.cat([-2 * o, torch.ones_like(o[..., :1]), o.square().sum(-1, keepdim=True)], dim=-1)
     along_ray = -(o * directions).sum(-1, keepdim=True)
     depth = torch.cat([directions, torch.zeros_like(along_ray), along_ray], dim=-1)
-    hidden = None if bool(valid.all()) else ~valid[:, None]
+    hidden = ~valid[:, None] if is_traced() or not bool(valid.all()) else None
     step = max(1, _PAIRS_PER_CHUNK.get(positions.device.type, 1 << 22) // (batch_size * num_particles))
     for start in range(0, num_rays, step):
         chunk = slice(start, start + step)
