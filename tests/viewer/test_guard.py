@@ -29,7 +29,8 @@ PROTOCOL = f"viser-v{viser.__version__}"
 @pytest.fixture(scope="module")
 def viewer(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("guard")
-    viewer = Viewer(open_tossed_box(folder), folder / "run" / "view", 0, TOKEN, 4)
+    viewer = Viewer(0, TOKEN)
+    viewer.show(open_tossed_box(folder), folder / "run" / "view", 4)
     viewer.folder = folder  # for the test that looks for strange files
     yield viewer
     viewer.stop()

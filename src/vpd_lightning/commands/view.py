@@ -41,14 +41,27 @@ def start(config: Mapping[str, Any]) -> Any:
         raise ConfigError(
             f"vpd-view needs {error.name}, which is not installed.\npip install 'vpd-lightning[viewer]'"
         ) from error
+    from vpd_lightning.viewer.guard import HOST, new_token
+    from vpd_lightning.viewer.server import Viewer
+
+    viewer = Viewer(config["port"], new_token())
+    try:
+        print(f"Open {viewer.url}\n")
+        print(f"From another machine: ssh -L {viewer.port}:{HOST}:{viewer.port} THIS_MACHINE, then the same address.")
+        print("Ctrl-C ends it.", flush=True)
+        _show(viewer, config)
+    except BaseException:
+        viewer.stop()
+        raise
+    return viewer
+
+
+def _show(viewer: Any, config: Mapping[str, Any]) -> None:
     from vpd_lightning.commands.eval import set_threads
     from vpd_lightning.commands.one_recording import choose_trajectory, data_set, load_particle_simulator
     from vpd_lightning.export.output_folder import beside_checkpoint
-    from vpd_lightning.viewer.guard import HOST, new_token, require_free
     from vpd_lightning.viewer.opened_scene import open_scene
-    from vpd_lightning.viewer.server import Viewer
 
-    require_free(config["port"])  # before the work
     set_threads(config["num_threads"])
     model = load_particle_simulator(config)
     manifest = data_set(config["data"]["folder"], model.config)
@@ -56,12 +69,8 @@ def start(config: Mapping[str, Any]) -> Any:
     start_frame = config["start_frame"]
     title = f"{model.name}, {manifest.relative(path)}, frame {start_frame}"
     opened = open_scene(model.simulator, path, start_frame, model.input_views, title)
-    folder = beside_checkpoint(model.path, "view")
-    viewer = Viewer(opened, folder, config["port"], new_token(), config["num_steps"])
-    print(f"{title}: open\n\n  {viewer.url}\n")
-    print(f"From another machine: ssh -L {viewer.port}:{HOST}:{viewer.port} THIS_MACHINE, then open the same address.")
-    print("Ctrl-C ends it.", flush=True)
-    return viewer
+    viewer.show(opened, beside_checkpoint(model.path, "view"), config["num_steps"])
+    print(title, flush=True)
 
 
 def _check(config: Mapping[str, Any]) -> None:

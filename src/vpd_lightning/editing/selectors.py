@@ -234,9 +234,14 @@ def selector_of(what: "Selector | Tensor") -> Selector:
 
 
 def _inside_polygon(pixels: Tensor, corners: Tensor) -> Tensor:
-    """Even-odd rule: how often does the line from a point to the right cross the polygon?"""
-    x, y = pixels[:, None].unbind(-1)
-    (x1, y1), (x2, y2) = corners.unbind(-1), corners.roll(-1, 0).unbind(-1)
-    crosses = (y1 <= y) != (y2 <= y)
-    height = torch.where(y2 == y1, 1.0, y2 - y1)
-    return (crosses & (x < x1 + (y - y1) / height * (x2 - x1))).sum(dim=1) % 2 == 1
+    """Even-odd rule: how often does the line from a point to the right cross the polygon?
+
+    Side after side: all at once would be (particle, corner) numbers, which no cache holds.
+    """
+    x, y = pixels.unbind(-1)
+    inside = torch.zeros_like(x, dtype=torch.bool)
+    ends = corners.tolist()
+    for (x1, y1), (x2, y2) in zip(ends, ends[1:] + ends[:1], strict=True):
+        if y1 != y2:
+            inside ^= ((y1 <= y) != (y2 <= y)) & (x < x1 + (y - y1) * ((x2 - x1) / (y2 - y1)))
+    return inside

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.evaluation.clip import encode_clip
-from vpd_lightning.evaluation.filming import read_context
+from vpd_lightning.evaluation.protocol import read_clip
 from vpd_lightning.export.camera_paths import common_target
 from vpd_lightning.export.particle_colors import particle_colors
 from vpd_lightning.geometry.cameras import unproject
@@ -55,6 +55,11 @@ class OpenedScene:
         """How many steps behind the last input frame were recorded."""
         return len(self.truth) - 1
 
+    @cached_property
+    def first_colors(self) -> UInt8[NDArray, "particle 3"]:
+        """Colours of the last input frame's particles: every client begins with them."""
+        return self.colors(self.scene.current)
+
     def colors(self, state: Particles) -> UInt8[NDArray, "particle 3"]:
         """Return the renderer's colour of each slot's particle; black for padding."""
         colors = np.zeros((state.num_particles, 3), np.uint8)
@@ -83,7 +88,7 @@ def open_scene(simulator: Simulator, path: Path, start: int, input_views: Sequen
     Raises:
         DataError: the recording lacks them.
     """
-    clip = read_context(path, start)
+    clip = read_clip(path, 0, start, num_steps=0, with_state=False)
     with TrajectoryReader(path) as reader:
         truth = reader.rgb(range(start + 1, reader.num_frames), range(reader.num_views))
         intrinsics, poses = reader.cameras([start + 1], range(reader.num_views))

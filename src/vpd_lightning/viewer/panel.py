@@ -173,7 +173,7 @@ class Panel:
         self.drawing.cameras(self.cameras_shown.value, self._looks_through)
         self.drawing.measured(step if self.truth_shown.value else None, self.point_size.value / 100)
         self.ask_picture()
-        if not self._playing.is_set():
+        if not self._playing.is_set() and not self._busy.locked():
             self._show_truth(step)
 
     def _show_truth(self, step: int) -> None:

@@ -1,38 +1,52 @@
-"""Start the viewer: one guarded server, one panel for each browser that comes."""
+"""Start the viewer: one guarded server, one panel for each browser that comes.
 
+The server starts before PyTorch is imported and the model is read, so that the browser can load the page meanwhile.
+"""
+
+import threading
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import viser
 
-from vpd_lightning.viewer.exports import ExportFolder
 from vpd_lightning.viewer.guard import HOST, cap_uploads, start_guarded_server
-from vpd_lightning.viewer.opened_scene import OpenedScene
-from vpd_lightning.viewer.panel import Panel
+
+if TYPE_CHECKING:
+    from vpd_lightning.viewer.opened_scene import OpenedScene
+    from vpd_lightning.viewer.panel import Panel
 
 
 class Viewer:
-    """A running viewer; ``url`` holds the token."""
+    """A running viewer; ``url`` holds the token. It says that it is loading until ``show`` gives it a scene."""
 
-    def __init__(self, opened: OpenedScene, folder: Path, port: int, token: str, num_steps: int):
-        self.opened = opened
+    def __init__(self, port: int, token: str):
         self.panels: dict[int, Panel] = {}
+        self._waiting: dict[int, tuple[Any, Any]] = {}
+        self._make_panel: Any = None
+        self._lock = threading.Lock()
         self.server: viser.ViserServer = start_guarded_server(port, token, "VPD")
         self.port = self.server.get_port()
         self.url = f"http://{HOST}:{self.port}/?token={token}"
+        self.server.on_client_connect(self._welcome)
+        self.server.on_client_disconnect(self._part)
+
+    def show(self, opened: "OpenedScene", folder: Path, num_steps: int) -> None:
+        """Give every browser, those that wait and those to come, a panel of its own; files go to ``folder``."""
+        from vpd_lightning.viewer.exports import ExportFolder
+        from vpd_lightning.viewer.panel import Panel
+
+        pose = opened.cameras.cam_to_world[opened.input_views[0]].double().numpy()
+        self.server.initial_camera.position = pose[:3, 3]
+        self.server.initial_camera.look_at = opened.target
+        self.server.initial_camera.up = (0.0, 0.0, 1.0)
         exports = ExportFolder(folder)
-        _place_initial_camera(self.server, opened)
-
-        @self.server.on_client_connect
-        def _(client: Any) -> None:
-            cap_uploads(client.gui)
-            self.panels[client.client_id] = Panel(client, opened, exports, num_steps)
-
-        @self.server.on_client_disconnect
-        def _(client: Any) -> None:
-            panel = self.panels.pop(client.client_id, None)
-            if panel is not None:
-                panel.close()
+        self.opened = opened
+        with self._lock:
+            self._make_panel = lambda client: Panel(client, opened, exports, num_steps)
+            waiting, self._waiting = self._waiting, {}
+        for client, note in waiting.values():
+            note.remove()
+            self._add_panel(client)
 
     def stop(self) -> None:
         """Close all connections and the port."""
@@ -40,9 +54,24 @@ class Viewer:
             panel.close()
         self.server.stop()
 
+    def _welcome(self, client: Any) -> None:
+        cap_uploads(client.gui)
+        with self._lock:
+            if self._make_panel is None:
+                self._waiting[client.client_id] = client, client.gui.add_markdown("Loading the model ...")
+                return
+        self._add_panel(client)
 
-def _place_initial_camera(server: viser.ViserServer, opened: OpenedScene) -> None:
-    pose = opened.cameras.cam_to_world[opened.input_views[0]].double().numpy()
-    server.initial_camera.position = pose[:3, 3]
-    server.initial_camera.look_at = opened.target
-    server.initial_camera.up = (0.0, 0.0, 1.0)
+    def _add_panel(self, client: Any) -> None:
+        panel = self._make_panel(client)
+        with self._lock:
+            self.panels[client.client_id] = panel
+        if client.client_id not in self.server.get_clients():  # it left meanwhile
+            self._part(client)
+
+    def _part(self, client: Any) -> None:
+        with self._lock:
+            self._waiting.pop(client.client_id, None)
+            panel = self.panels.pop(client.client_id, None)
+        if panel is not None:
+            panel.close()

@@ -44,6 +44,7 @@ class Session:
         self.opened = opened
         self.lock = threading.RLock()
         self.now = self._fresh(colored_editor(opened.simulator, opened.scene, opened.viewpoint))
+        self.now.colors[0] = opened.first_colors
         self.kept: Rollout | None = None
         self.selector: Selector | None = None
         self._generation = 0
