@@ -19,7 +19,7 @@ STAMP := $(VENV)/.installed
 
 export MPLBACKEND = Agg
 
-.PHONY: audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
+.PHONY: view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
 	types imports docs cluster bench stability paper-step wheel clean
 
 help: ## List the targets
@@ -60,6 +60,19 @@ eval-demo: $(STAMP) ## Evaluate the demo on its test trajectories and print the 
 
 video-demo: $(STAMP) ## Film a predicted rollout of the demo
 	$(BIN)/vpd-render ckpt=$(DEMO_RUN)/checkpoints/last.ckpt data.folder=$(DEMO_DATA) out=$(call NEW_FOLDER,$(DEMO_RUN)/render)
+
+VIEW_MODEL ?= released/mujoco_block_demo
+view: $(STAMP) ## Open the browser viewer on a trained model (VIEW_MODEL=released/mujoco_block_demo)
+	$(BIN)/vpd-view ckpt=$(VIEW_MODEL)
+
+EDIT_DATA ?= datasets/deformable_collision_tiny
+editing-figure: $(STAMP) ## Draw the paper's editing figure: no ball, no cube, no floor (needs GL; half a minute)
+	$(BIN)/vpd-data generate scene=deformable_collision preset=tiny out=$(EDIT_DATA) seed=0
+	$(BIN)/python -m benchmarks.editing_figure released/deformable_collision_inertial --data $(EDIT_DATA) --start 8 --out $(call NEW_FOLDER,runs/editing_figure)
+
+novel-view-figure: $(STAMP) ## Draw the paper's novel-view figure: a ring of cameras after 15 steps
+	$(BIN)/vpd-data generate scene=deformable_collision preset=tiny out=$(EDIT_DATA) seed=0
+	$(BIN)/vpd-render ckpt=released/deformable_collision_inertial data.folder=$(EDIT_DATA) freeze_step=15 camera=ring num_views=8 out=$(call NEW_FOLDER,runs/novel_view_figure)
 
 test: $(STAMP) ## Run all tests (no GPU and no torch-cluster needed; about 17 minutes on two cores)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --durations=15 --durations-min=5

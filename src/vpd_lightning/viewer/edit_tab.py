@@ -167,6 +167,11 @@ class EditTab:
                 self._preview.visible = True
                 self._preview.position, self._preview.wxyz = self._gizmo.position, self._gizmo.wxyz
 
+    def show_gizmo(self, visible: bool) -> None:
+        """Show the gizmo where there is one: an edit is of the last input frame, and not of what is predicted."""
+        if self._gizmo is not None:
+            self._gizmo.visible = visible
+
     def _move(self) -> None:
         selector = self.session.need_selection()
         if self._gizmo is None:

@@ -172,6 +172,7 @@ class Panel:
         self.drawing.particles(step, with_points, self.point_size.value / 100)
         self.drawing.cameras(self.cameras_shown.value, self._looks_through)
         self.drawing.measured(step if self.truth_shown.value else None, self.point_size.value / 100)
+        self.edit_tab.show_gizmo(step == 0)
         self.ask_picture()
         if not self._playing.is_set() and not self._busy.locked():
             self._show_truth(step)
