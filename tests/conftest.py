@@ -13,6 +13,12 @@ import torch
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 torch.set_num_threads(1)
 
+# The shape checks look for other bytecode while a module of ours is imported, also for what that module imports: these
+# packages would be compiled anew in each test process, which takes ten seconds.
+for _name in ("lightning.pytorch", "torch_geometric", "numba", "scipy.spatial"):
+    if importlib.util.find_spec(_name.partition(".")[0]) is not None:
+        importlib.import_module(_name)
+
 
 def _gl_works() -> bool:
     if importlib.util.find_spec("data_gen.gl_backend") is None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from data_gen.generate import generate
+from tests.shared_folder import made_once
 from vpd_lightning.commands import train
 
 SMALL = {"num_frames": 10, "camera.num_views": 3, "camera.height": 32, "camera.width": 32}
@@ -15,8 +16,11 @@ SMALL = {"num_frames": 10, "camera.num_views": 3, "camera.height": 32, "camera.w
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three cameras of 32x32, ten frames of a tossed block, ray cast."""
-    folder = tmp_path_factory.mktemp("data") / "tiny"
-    return generate("mujoco_block", "tiny", folder, seed=0, workers=1, overrides=SMALL)
+    return made_once(
+        tmp_path_factory,
+        "tiny_data",
+        lambda folder: generate("mujoco_block", "tiny", folder, seed=0, workers=1, overrides=SMALL),
+    )
 
 
 @pytest.fixture(scope="session")
@@ -32,9 +36,11 @@ def quick(dataset: Path) -> list[str]:
 @pytest.fixture(scope="session")
 def trained(quick: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of a training of two steps; do not write into it."""
-    folder = tmp_path_factory.mktemp("trained") / "run"
-    assert train.main([*quick, f"run.folder={folder}"]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        assert train.main([*quick, f"run.folder={folder}"]) == 0
+
+    return made_once(tmp_path_factory, "tiny_run", make)
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """The stages as conf/ builds them, at a small size, with noisy weights, and the states that they are tried on."""
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -113,7 +114,22 @@ def _changed(section: Any, scale: float, changes: dict[str, Any]) -> Any:
 
 
 def stage(group: str, option: str, mode: Mode, device: torch.device, scale: float = 1.0, **changes: Any) -> nn.Module:
-    """Build an option in the precision under test; ``scale`` multiplies every length in its settings."""
+    """Build an option in the precision under test; ``scale`` multiplies every length in its settings.
+
+    Thousands of cases want the same few hundred modules, so each is built once and then copied.
+    """
+    key = repr((group, option, mode.dtype, device, scale, sorted(changes.items())))
+    if key not in _BUILT:
+        _BUILT[key] = _built(group, option, mode, device, scale, changes)
+    return deepcopy(_BUILT[key])
+
+
+_BUILT: dict[str, nn.Module] = {}
+
+
+def _built(
+    group: str, option: str, mode: Mode, device: torch.device, scale: float, changes: dict[str, Any]
+) -> nn.Module:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         built = build(_changed(_composed(group, option), scale, changes), BASES[group], group).to(device, mode.dtype)

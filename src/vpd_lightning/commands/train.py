@@ -17,7 +17,7 @@ SECTIONS = (
     "model", "data", "encoder", "dynamics", "renderer", "loss", "optimizer", "trainer", "callbacks", "logger"
 )  # fmt: skip
 # Sections refer to the run folder, which has no name yet when they are checked.
-_PROBE = ("run.folder=not-chosen-yet",)
+_NOT_CHOSEN = "not-chosen-yet"
 
 log = logging.getLogger(__name__)
 
@@ -60,14 +60,15 @@ def _train_sweep(arguments: Arguments) -> int:
 def _train_as_told(arguments: Arguments) -> int:
     """One run, or with -m one for each combination of the values that are listed."""
     from vpd_lightning.commands.resume import resumed_overrides, wants_auto
-    from vpd_lightning.config import compose, expand_sweep
+    from vpd_lightning.config import compose_with_folder, expand_sweep
 
     overrides = resumed_overrides(arguments.overrides)
     jobs = expand_sweep("train", overrides, arguments.config_dir) if arguments.is_multirun else [overrides]
-    configs = [compose("train", words, arguments.config_dir) for words in jobs]
+    pairs = [compose_with_folder(words, arguments.config_dir, _NOT_CHOSEN) for words in jobs]
+    configs = [config for config, _ in pairs]
     _check_places(configs, overrides, arguments)
-    for words in jobs:
-        _check_sections(compose("train", [*words, *_PROBE], arguments.config_dir))
+    for _, placed in pairs:
+        _check_sections(placed)
     if wants_auto(arguments.overrides):
         _make_room(configs[0])
 

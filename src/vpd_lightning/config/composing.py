@@ -59,6 +59,33 @@ def compose(command: str, overrides: Sequence[str], config_dir: str | Path | Non
     Raises:
         ConfigError: an unknown key, option or type, a value out of range, or a bypass of the schema.
     """
+    return _composed(command, overrides, config_dir)[1]
+
+
+def compose_with_folder(
+    overrides: Sequence[str], config_dir: str | Path | None, folder: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the configuration of ``vpd-train`` as ``compose`` does, and as it is once it has a run folder.
+
+    Composing takes most of the time until a training starts, and the two differ in what refers to the folder alone.
+
+    Args:
+        overrides: words as on the command line.
+        config_dir: a folder with further options (``--config-dir``).
+        folder: the run folder of the second configuration where the first one has none.
+
+    Raises:
+        ConfigError: see ``compose``.
+    """
+    config, result = _composed("train", overrides, config_dir)
+    if result["run"]["folder"]:
+        return result, result
+    config.run.folder = folder
+    return result, plain(config)
+
+
+def _composed(command: str, overrides: Sequence[str], config_dir: str | Path | None) -> tuple[Any, dict[str, Any]]:
+    """Return the configuration as Hydra made it, and the plain and checked one."""
     prepare()
     refuse_bypasses(overrides)
     config = _compose(command, overrides, config_dir)
@@ -70,7 +97,7 @@ def compose(command: str, overrides: Sequence[str], config_dir: str | Path | Non
         check_scene(result["scene"])
     if command == "train":
         check_training(result)
-    return result
+    return config, result
 
 
 def plain(config: Any) -> dict[str, Any]:
