@@ -6,7 +6,9 @@ After a change of a message: ``VPD_WRITE_ERRORS=1 pytest tests/commands/test_com
 import os
 import re
 import shutil
+import socket
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import pytest
 import torch
 
 from tests.data.recordings import write_recordings
-from vpd_lightning.commands import data, eval, export, info, render, report, run_claim, train
+from vpd_lightning.commands import data, eval, export, info, render, report, run_claim, train, view
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "errors.md"
 HEAD = """# Common mistakes, and what is said
@@ -24,7 +26,7 @@ written by `tests/commands/test_common_mistakes.py`, which makes each mistake.
 """
 MAINS = {
     "vpd-train": train.main, "vpd-eval": eval.main, "vpd-render": render.main, "vpd-data": data.main,
-    "vpd-export": export.main, "vpd-report": report.main, "vpd-info": info.main,
+    "vpd-export": export.main, "vpd-report": report.main, "vpd-info": info.main, "vpd-view": view.main,
 }  # fmt: skip
 
 
@@ -54,6 +56,20 @@ def _out_of_memory(patch: pytest.MonkeyPatch) -> None:
 
 def _no_gl(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("data_gen.gl_backend.why_not", lambda backend: "its library is missing")
+
+
+_HELD: list[socket.socket] = []
+
+
+def _taken_port(patch: pytest.MonkeyPatch) -> None:
+    _HELD.append(socket.socket())
+    with suppress(OSError):  # taken already: as well
+        _HELD[-1].bind(("127.0.0.1", 8765))
+        _HELD[-1].listen()
+
+
+def _typo_in_edit(patch: pytest.MonkeyPatch) -> None:
+    Path("typo.yaml").write_text("vpd_edit: 1\nedits:\n- {edit: delete, select: {clustr: {index: 0}}}\n")
 
 
 def _cut_data(patch: pytest.MonkeyPatch) -> None:
@@ -113,6 +129,9 @@ MISTAKES = [
     Mistake("A recording of no known kind", "vpd-data import runs out=made", 3),
     Mistake("A model that was not evaluated", "vpd-export ckpt=runs/trained out=released/mine", 2),
     Mistake("A report about nothing", "vpd-report runs", 3),
+    Mistake("A port that something listens on", "vpd-view ckpt=runs/trained port=8765", 2, before=_taken_port),
+    Mistake("An edit that is not there", "vpd-render ckpt=runs/trained edit=no_ball.yaml", 2),
+    Mistake("A typo in an edit", "vpd-render ckpt=runs/trained edit=typo.yaml", 2, before=_typo_in_edit),
     Mistake("An option that vpd-info does not have", "vpd-info --jsn", 2),
 ]  # fmt: skip
 

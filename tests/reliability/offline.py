@@ -11,6 +11,19 @@ from tests.reliability.trainings import environment, make_data, words
 _PREFIX = ("unshare", "--map-root-user", "--net")
 
 
+# The page needs the loopback interface, which a process that owns its namespace may bring up.
+_VIEW = """
+import fcntl, socket, struct, sys, urllib.request
+SIOCSIFFLAGS, IFF_UP, IFF_RUNNING = 0x8914, 0x1, 0x40
+fcntl.ioctl(socket.socket(), SIOCSIFFLAGS, struct.pack("16sH14s", b"lo", IFF_UP | IFF_RUNNING, b""))
+from vpd_lightning.commands.view import start
+from vpd_lightning.config import compose
+viewer = start(compose("view", sys.argv[1:]))
+assert b"<html" in urllib.request.urlopen(viewer.url, timeout=60).read()
+viewer.stop()
+"""
+
+
 def is_possible() -> bool:
     """Whether this machine lets us make a network namespace."""
     try:
@@ -43,6 +56,7 @@ def offline(work: Path) -> list[Outcome]:
         "vpd-export": [*_module("export"), f"ckpt={run}", f"out={released}"],
         "vpd_lightning.load": ["-c", load],
         "vpd-info": [*_module("info")],
+        "vpd-view": ["-c", _VIEW, f"ckpt={run}", "port=0"],
     }
     failed = {name: done for name, command in commands.items() if (done := _call(*command)).returncode != 0}
     for name, done in failed.items():
