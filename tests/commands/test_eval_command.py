@@ -1,6 +1,7 @@
 """``vpd-eval`` from its words to its files, and what it refuses."""
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -41,12 +42,18 @@ def test_an_evaluation_writes_everything_and_prints_its_path_last(
         "config.yaml",
         "contact_sheet.png",
         "curves.png",
+        "index.html",
         "metrics.csv",
         "metrics.json",
         "rollouts.npz",
         "videos",
     ]
+    page = (folder / "index.html").read_text()
+    shown = re.findall(r'src="([^"]+)"', page)
+    assert {"curves.png", "contact_sheet.png"} < set(shown) and any(name.endswith(".webm") for name in shown)
+    assert all((folder / name).is_file() for name in shown) and "://" not in page
     metrics = json.loads((folder / "metrics.json").read_text())
+    assert f"{metrics['psnr']['per_step'][2]:.4g}" in page and "moving pixels (dB)" in page
     assert metrics["step"] == 7 and len(metrics["checkpoint_sha256"]) == len(metrics["data_sha256"]) == 64
     assert (metrics["system"], metrics["experiment"], metrics["seed"]) == ("vpd", metrics["model"], 0)
     assert metrics["num_parameters"] == sum(p.numel() for p in vpd_lightning.load(checkpoint).parameters()) > 0
@@ -154,7 +161,7 @@ def test_a_data_set_that_is_gone_is_made_again_where_the_training_would_make_it(
         asked.append(Path(config["data"]["folder"]))
         gone.symlink_to(data)
 
-    monkeypatch.setattr("vpd_lightning.commands.evaluation_run.provide_data", provide)
+    monkeypatch.setattr("vpd_lightning.commands.one_recording.provide_data", provide)
     code = main([f"ckpt={checkpoint}", "num_videos=0", "protocol.num_trajectories=1", "protocol.num_long_steps=0"])
     assert (code, asked) == ((0, [gone]) if is_made else (3, []))
 

@@ -19,6 +19,7 @@ from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.evaluation.report import metrics_of, write_metrics
 from vpd_lightning.evaluation.rollouts import MAX_CLIPS, write_rollouts
 from vpd_lightning.evaluation.summary import summary_lines
+from vpd_lightning.evaluation.web_page import write_web_page
 from vpd_lightning.export.output_folder import OutputFolder, beside_checkpoint, choose_folder
 from vpd_lightning.export.release_folder import is_release
 from vpd_lightning.loading import LoadedModel, load_model
@@ -53,6 +54,7 @@ def run_evaluation(config: Mapping[str, Any]) -> Path:
             _write_config(partial / "config.yaml", content["hyper_parameters"])
         metrics["training"] = None if content is None else training_of(content, model.path)
         path = folder / write_metrics(partial, metrics, evaluation).name
+        write_web_page(partial, metrics)
     print(f"{model.name}, step {model.step}: {model.path}")
     print("\n".join(summary_lines(metrics)))
     print()
