@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -190,20 +189,16 @@ def test_flags_may_stand_anywhere_among_the_settings(line: str, capsys: pytest.C
 
 
 @pytest.mark.slow
-def test_help_needs_neither_torch_nor_three_seconds(tmp_path: Path):
+def test_help_needs_no_torch(tmp_path: Path):  # tests/test_architecture.py looks at the time
     code = (
         "import sys; from vpd_lightning.commands import train; code = train.main(['--help']);"
         "assert 'torch' not in sys.modules and 'lightning' not in sys.modules; sys.exit(code)"
     )
     environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}"}
 
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
 
     assert done.returncode == 0, done.stderr
-    # Processor time: other processes take none of it. About 1 s.
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 3
 
 
 @pytest.mark.slow
