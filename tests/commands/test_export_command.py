@@ -14,7 +14,7 @@ from vpd_lightning.evaluation.clip import encode_clip
 from vpd_lightning.evaluation.protocol import read_clip
 from vpd_lightning.geometry.cameras import pixel_rays
 from vpd_lightning.loading import load_model
-from vpd_lightning.training.checkpoint_io import write_checkpoint
+from vpd_lightning.training.checkpoint_files import write_checkpoint
 from vpd_lightning.types import Rays
 
 RELEASED = Path(__file__).parents[2] / "released" / "mujoco_block_demo"

@@ -101,7 +101,34 @@ def answer(command: str, argv: Sequence[str]) -> None:
         return
     if any(flag in ("--cfg", "-c") for flag in (flag.partition("=")[0] for flag in arguments.flags)):
         compose(command, arguments.overrides, arguments.config_dir)  # a named error instead of Hydra's
-    run_hydra(command, argv, lambda config: None)
+    with _options_copied_once():
+        run_hydra(command, argv, lambda config: None)
+
+
+@contextmanager
+def _options_copied_once() -> Iterator[None]:
+    """Let Hydra list options quickly: for each group of a help text it copies all that it knows, in two seconds.
+
+    What is copied is only read while nothing is overridden, so that one copy will do.
+    """
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+
+    name = "_parse_overrides_and_create_caching_repo"
+    original = getattr(ConfigLoaderImpl, name)
+    kept: dict[Any, Any] = {}
+
+    def copy_once(loader: Any, config_name: Any, overrides: Any) -> Any:
+        if config_name is not None or overrides:
+            return original(loader, config_name, overrides)
+        if loader not in kept:
+            kept[loader] = original(loader, config_name, overrides)
+        return kept[loader]
+
+    setattr(ConfigLoaderImpl, name, copy_once)
+    try:
+        yield
+    finally:
+        setattr(ConfigLoaderImpl, name, original)
 
 
 def run_hydra(command: str, argv: Sequence[str], task: Callable[[Any], Any]) -> None:

@@ -14,7 +14,7 @@ from tests.training.tiny_training import SignalAt, tiny_data, tiny_module, tiny_
 from vpd_lightning.commands import train
 from vpd_lightning.loading import load_model, simulator_weights
 from vpd_lightning.training.callbacks.average_weights import CURRENT, AverageWeights
-from vpd_lightning.training.checkpoint_io import load_checkpoint
+from vpd_lightning.training.checkpoint_files import load_checkpoint
 from vpd_lightning.training.checkpoints import find_resume
 from vpd_lightning.training.module import BEST_METRIC
 
