@@ -10,8 +10,10 @@ from tests.evaluation.tossed_box import write_tossed_boxes
 from tests.released_model import figures, write_run
 from vpd_lightning.commands import eval as evaluation
 from vpd_lightning.commands import export, info
+from vpd_lightning.errors import CheckpointError
 from vpd_lightning.evaluation.clip import encode_clip
 from vpd_lightning.evaluation.protocol import read_clip
+from vpd_lightning.export.release_folder import check_release, sha256
 from vpd_lightning.geometry.cameras import pixel_rays
 from vpd_lightning.loading import load_model
 from vpd_lightning.training.checkpoint_files import write_checkpoint
@@ -99,6 +101,36 @@ def test_bad_words_get_a_named_error(
 def test_a_release_is_not_released_again(run: Path, in_folder: Path, fails) -> None:
     assert export.main([f"ckpt={run}", "out=released/boxes"]) == 0
     assert "released model already" in fails(export.main, ["ckpt=released/boxes", "out=again"], 2)
+    words = ["ckpt=released/boxes", "out=again", "renderer_program=8"]
+    assert "Leave metrics out" in fails(export.main, [*words, "metrics=some.json"], 2)
+    assert "PointNeRFRenderer cannot be exported" in fails(export.main, words, 2)
+    assert not (in_folder / "again").exists()
+
+
+@pytest.mark.slow
+def test_a_copy_of_a_release_gets_its_renderer_as_a_program(in_folder: Path, fails) -> None:
+    assert export.main([f"ckpt={RELEASED}", "out=copy", "renderer_program=8"]) == 0
+    copy, source = check_release(in_folder / "copy"), check_release(RELEASED)
+    program = (in_folder / "copy" / "renderer.pt2").read_bytes()
+    assert copy["sha256"] == source["sha256"] | {"renderer.pt2": sha256(program)}
+    assert {**copy, "sha256": None} == {**source, "sha256": None}
+    load_model(in_folder / "copy")
+    (in_folder / "copy" / "renderer.pt2").write_bytes(program[:-1])
+    with pytest.raises(CheckpointError, match=r"renderer\.pt2 is damaged"):
+        check_release(in_folder / "copy")
+    (in_folder / "copy" / "renderer.pt2").unlink()
+    with pytest.raises(CheckpointError, match=r"renderer\.pt2 is missing"):
+        check_release(in_folder / "copy")
+    words = ["out=small", "renderer_program=8"]
+    assert "renderer.pt2 is missing" in fails(export.main, ["ckpt=copy/model.safetensors", *words], 4)
+    assert "max_megabytes" in fails(export.main, [f"ckpt={RELEASED}", *words, "max_megabytes=0.1"], 2)
+
+
+def test_a_program_that_the_index_does_not_name_is_a_fault(run: Path, in_folder: Path) -> None:
+    assert export.main([f"ckpt={run}", "out=released/boxes"]) == 0
+    (in_folder / "released" / "boxes" / "renderer.pt2").write_bytes(b"strange")
+    with pytest.raises(CheckpointError, match="does not name it"):
+        check_release(in_folder / "released" / "boxes")
 
 
 def test_help(capsys: pytest.CaptureFixture[str], in_folder: Path) -> None:

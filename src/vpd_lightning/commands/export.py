@@ -28,31 +28,46 @@ def _run(words: list[str]) -> int:
 
 def _export(config: Mapping[str, Any]) -> None:
     from vpd_lightning.export.output_folder import OutputFolder, choose_folder
-    from vpd_lightning.export.release import TrainedSystem, find_metrics, write_release
+    from vpd_lightning.export.release import TrainedSystem, copy_release, find_metrics, write_release
     from vpd_lightning.export.release_folder import folder_bytes, is_release
     from vpd_lightning.loading import load_model
 
     source, folder = Path(config["ckpt"]).expanduser(), choose_folder(config["out"], Path())
-    if is_release(source):
-        raise ConfigError(f"{source} is a released model already.\nGive a run folder or a checkpoint.")
-    if config["renderer_program"] is not None and not 1 <= config["renderer_program"] <= _MAX_RAYS:
-        raise ConfigError(
-            f"renderer_program={config['renderer_program']} is out of range.\nAllowed: 1 to {_MAX_RAYS} rays, or null."
-        )
+    num_rays = config["renderer_program"]
+    _check(config, source)
     model = load_model(source)
     trained = TrainedSystem(system=model.simulator, config=model.config, checkpoint=model.path, step=model.step)
-    metrics = find_metrics(trained, config["metrics"])
+    metrics = None if is_release(source) else find_metrics(trained, config["metrics"])
     with OutputFolder(folder) as partial:
-        if config["renderer_program"] is not None:  # first: it counts among the megabytes
-            _write_renderer(partial, model.simulator, config["renderer_program"])
-        write_release(partial, trained, metrics, name=folder.name, max_megabytes=config["max_megabytes"])
+        if num_rays is not None:  # first: it counts among the megabytes
+            _write_renderer(partial, model.simulator, num_rays)
+        if metrics is None:
+            copy_release(model.path.parent, partial, max_megabytes=config["max_megabytes"])
+        else:
+            write_release(partial, trained, metrics, name=folder.name, max_megabytes=config["max_megabytes"])
     print(f"{model.name}, step {model.step}: {model.path}")
     print(f"{folder_bytes(folder) / 1e6:.1f} MB")
     print(folder)
 
 
+def _check(config: Mapping[str, Any], source: Path) -> None:
+    from vpd_lightning.export.release_folder import is_release
+
+    num_rays = config["renderer_program"]
+    if is_release(source) and num_rays is None:
+        raise ConfigError(
+            f"{source} is a released model already.\n"
+            "Give a run folder or a checkpoint; or renderer_program=RAYS for a copy with its renderer as a program."
+        )
+    if is_release(source) and config["metrics"] is not None:
+        raise ConfigError(f"{source} has its figures already.\nLeave metrics out.")
+    if num_rays is not None and not 1 <= num_rays <= _MAX_RAYS:
+        raise ConfigError(f"renderer_program={num_rays} is out of range.\nAllowed: 1 to {_MAX_RAYS} rays, or null.")
+
+
 def _write_renderer(folder: Path, system: Any, num_rays: int) -> None:
-    from vpd_lightning.export.renderer_program import PROGRAM_FILE, export_renderer, write_program
+    from vpd_lightning.export.release_folder import PROGRAM_FILE
+    from vpd_lightning.export.renderer_program import export_renderer, write_program
     from vpd_lightning.simulator import Simulator
 
     num_particles = getattr(getattr(system, "encoder", None), "num_particles", None)

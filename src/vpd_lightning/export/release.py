@@ -21,7 +21,9 @@ from vpd_lightning.export.release_folder import (
     FORMAT_VERSION,
     INDEX_FILE,
     METRICS_FILE,
+    PROGRAM_FILE,
     WEIGHTS_FILE,
+    check_release,
     folder_bytes,
     sha256,
 )
@@ -106,7 +108,7 @@ def _require_plain_test(metrics: Mapping[str, Any], path: Path, checkpoint: Path
 def write_release(
     folder: Path, trained: TrainedSystem, metrics: Mapping[str, Any], *, name: str, max_megabytes: float
 ) -> None:
-    """Write a released model called ``name`` into an empty folder.
+    """Write a released model called ``name`` into a folder that is empty, or holds a renderer's program.
 
     Raises:
         ConfigError: it would be larger than ``max_megabytes``, or cannot be freed of this machine's paths.
@@ -131,7 +133,7 @@ def write_release(
         "step": trained.step,
         "num_parameters": num_parameters,
         "psnr": figures["psnr"]["mean"],
-        "sha256": {file: sha256(content[file]) for file in CHECKED_FILES},
+        "sha256": {file: sha256(content[file]) for file in CHECKED_FILES} | _program_digest(folder),
     }
     environment = _run_file(trained.checkpoint, "environment.json") or {}
     card = CardContent(
@@ -150,6 +152,30 @@ def write_release(
         (folder / file).write_bytes(text)
     (folder / INDEX_FILE).write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
     (folder / CARD_FILE).write_text(model_card(card), encoding="utf-8")
+    _require_size(folder, max_megabytes, num_parameters)
+
+
+def copy_release(source: Path, folder: Path, *, max_megabytes: float) -> None:
+    """Copy a released model into a folder that is empty, or holds a renderer's program, which then belongs to it.
+
+    Raises:
+        CheckpointError: the source is not whole.
+        ConfigError: the copy would be larger than ``max_megabytes``.
+    """
+    index = check_release(source)
+    for file in (*CHECKED_FILES, CARD_FILE):
+        (folder / file).write_bytes((source / file).read_bytes())
+    index["sha256"] = {file: index["sha256"][file] for file in CHECKED_FILES} | _program_digest(folder)
+    (folder / INDEX_FILE).write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
+    _require_size(folder, max_megabytes, index["num_parameters"])
+
+
+def _program_digest(folder: Path) -> dict[str, str]:
+    path = folder / PROGRAM_FILE
+    return {PROGRAM_FILE: sha256(path.read_bytes())} if path.is_file() else {}
+
+
+def _require_size(folder: Path, max_megabytes: float, num_parameters: int) -> None:
     size = folder_bytes(folder) / _MEGABYTE
     if size > max_megabytes:
         raise ConfigError(

@@ -21,8 +21,9 @@ CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.json"
 CARD_FILE = "README.md"
 INDEX_FILE = "release.json"
+PROGRAM_FILE = "renderer.pt2"
 CHECKED_FILES = (WEIGHTS_FILE, CONFIG_FILE, METRICS_FILE)
-"""Files whose SHA-256 stands in the index; the card is for people."""
+"""Files whose SHA-256 stands in the index, as that of a renderer's program does; the card is for people."""
 
 _MAX_TEXT_BYTES = 4 * 2**20
 _AGAIN = "Fetch the folder again, or export the model again with vpd-export."
@@ -104,8 +105,13 @@ def check_release(folder: Path) -> dict[str, Any]:
         CheckpointError: a file is missing or damaged.
     """
     index = read_index(folder)
-    for name in CHECKED_FILES:
+    has_program = PROGRAM_FILE in index["sha256"]
+    for name in (*CHECKED_FILES, PROGRAM_FILE) if has_program else CHECKED_FILES:
         _checked_bytes(folder / name, index["sha256"])
+    if (folder / PROGRAM_FILE).exists() and not has_program:
+        raise CheckpointError(
+            f"{folder / PROGRAM_FILE} does not belong there: {INDEX_FILE} does not name it.\n{_AGAIN}"
+        )
     if not (folder / CARD_FILE).is_file():
         raise CheckpointError(f"{folder} is not whole: {CARD_FILE} is missing.\n{_AGAIN}")
     return index
@@ -138,7 +144,7 @@ def sha256(content: bytes) -> str:
 
 
 def _checked_bytes(path: Path, digests: Mapping[str, str]) -> bytes:
-    content = _read_bytes(path, None if path.name == WEIGHTS_FILE else _MAX_TEXT_BYTES)
+    content = _read_bytes(path, None if path.name in (WEIGHTS_FILE, PROGRAM_FILE) else _MAX_TEXT_BYTES)
     if sha256(content) != digests[path.name]:
         raise CheckpointError(f"{path} is damaged: its SHA-256 is not the one in {INDEX_FILE}.\n{_AGAIN}")
     return content

@@ -14,7 +14,6 @@ from vpd_lightning.errors import ConfigError
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.types import Particles, Rays
 
-PROGRAM_FILE = "renderer.pt2"
 _TOLERANCE = 1e-5
 
 
