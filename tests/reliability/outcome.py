@@ -1,6 +1,8 @@
 """What a reliability check found, and how it is written down."""
 
+import fcntl
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,10 +29,15 @@ class Outcome:
 
 def write(check: str, outcomes: Sequence[Outcome], seconds: float, path: Path = RESULTS) -> None:
     """Put the outcomes of one check in place of its last ones."""
-    content = json.loads(path.read_text()) if path.is_file() else {}
-    content[check] = {"seconds": round(seconds), "outcomes": [asdict(item) for item in outcomes]}
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(dict(sorted(content.items())), indent=1) + "\n")
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)  # checks run in several processes
+        content = json.loads(path.read_text()) if path.is_file() else {}
+        content[check] = {"seconds": round(seconds), "outcomes": [asdict(item) for item in outcomes]}
+        path.write_text(json.dumps(dict(sorted(content.items())), indent=1) + "\n")
+    finally:
+        os.close(folder)
 
 
 def read(path: Path = RESULTS) -> dict[str, list[Outcome]]:

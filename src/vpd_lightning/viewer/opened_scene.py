@@ -55,6 +55,14 @@ class OpenedScene:
         """How many steps behind the last input frame were recorded."""
         return len(self.truth) - 1
 
+    @property
+    def observed_colors(self) -> UInt8[NDArray, "particle 3"]:
+        """Colours that the encoder saw at the last input frame, without asking the renderer; grey if it saw none."""
+        current = self.scene.current
+        if current.colors is None:
+            return np.full((current.num_particles, 3), 128, np.uint8)
+        return (current.colors[0].float().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
     @cached_property
     def first_colors(self) -> UInt8[NDArray, "particle 3"]:
         """Colours of the last input frame's particles: every client begins with them."""

@@ -56,6 +56,8 @@ class Panel:
         client.camera.on_update(lambda _: self.ask_picture())
         threading.Thread(target=self._play, daemon=True, name="vpd-view playing").start()
         self.look_through(opened.input_views[0])
+        self.drawing.first_particles(self.point_size.value / 100)  # the renderer's colours take a second more
+        self.figures.content = self._step_line(0)
         self.redraw()
 
     def _add_view_tab(self) -> None:
@@ -184,13 +186,17 @@ class Panel:
         known = step <= self.opened.num_true_steps
         self.true_image.image = self.opened.truth[step, view] if known else np.zeros_like(image)
         figures = self.session.measure(step, view, image)
-        lines = [f"step **{step}** of {self.session.now.num_steps}, {int(figures['particles'])} particles"]
+        lines = [self._step_line(step)]
         if known:
             lines.append(f"camera {view}: PSNR **{figures['psnr']:.2f} dB**")
             lines.append(f"to measured points: **{100 * figures['chamfer']:.1f} cm** (Chamfer)")
         else:
             lines.append("behind the end of the recording")
         self.figures.content = "  \n".join(lines)
+
+    def _step_line(self, step: int) -> str:
+        num_particles = int(self.session.shown_state(step).mask.sum())
+        return f"step **{step}** of {self.session.now.num_steps}, {num_particles} particles"
 
     def viewpoint(self) -> Viewpoint:
         """Return the browser's camera."""
@@ -204,9 +210,9 @@ class Panel:
             self.client.scene.set_background_image(None)
             return
         step = int(self.step.value)
-        states = [self.session.shown(step)[0]]
+        states = [self.session.shown_state(step)]
         if self.session.kept is not None:
-            states.append(self.session.shown(step, of_kept=True)[0])
+            states.append(self.session.shown_state(step, of_kept=True))
         self.view.ask(Request(states, self.viewpoint(), int(self.rows.value)))
 
     def _show_picture(self, image: np.ndarray, is_full: bool) -> None:

@@ -20,6 +20,13 @@ class SceneDrawing:
         opened = session.opened
         self.beside = np.array([_BESIDE * (opened.workspace_max[0] - opened.workspace_min[0]), 0.0, 0.0])
 
+    def first_particles(self, size: float) -> None:
+        """Draw the particles as they were observed, before the renderer has coloured any."""
+        current = self.session.opened.scene.current
+        there = current.mask[0].cpu().numpy()
+        points = current.positions[0].float().cpu().numpy()[there]
+        self._cloud("now", points, self.session.opened.observed_colors[there], size, True, np.zeros(3))
+
     def particles(self, step: int, visible: bool, size: float) -> None:
         """Draw the particles of a step, those of the kept scene beside it, and at step 0 the selection."""
         for name, of_kept in (("now", False), ("kept", True)):

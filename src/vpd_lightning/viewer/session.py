@@ -44,7 +44,6 @@ class Session:
         self.opened = opened
         self.lock = threading.RLock()
         self.now = self._fresh(colored_editor(opened.simulator, opened.scene, opened.viewpoint))
-        self.now.colors[0] = opened.first_colors
         self.kept: Rollout | None = None
         self.selector: Selector | None = None
         self._generation = 0
@@ -147,22 +146,32 @@ class Session:
             self.selector = None
             self._generation += 1
 
-    def shown(self, step: int, of_kept: bool = False) -> tuple[Particles, UInt8[NDArray, "particle 3"]]:
-        """Return a state (the last one, if it was not simulated so far) and the colours of its particles."""
+    def shown_state(self, step: int, of_kept: bool = False) -> Particles:
+        """Return the state of a step; the last one, if that step was not simulated so far."""
         with self.lock:
-            rollout = self.kept if of_kept and self.kept is not None else self.now
-            step = min(max(step, 0), rollout.num_steps)
+            rollout, step = self._at(step, of_kept)
+            return rollout.states[step]
+
+    def shown(self, step: int, of_kept: bool = False) -> tuple[Particles, UInt8[NDArray, "particle 3"]]:
+        """Return the state of a step, as ``shown_state`` does, and the colours of its particles."""
+        with self.lock:
+            rollout, step = self._at(step, of_kept)
             state = rollout.states[step]
             if step in rollout.colors:
                 return state, rollout.colors[step]
-        colors = self.opened.colors(state)
+        is_as_recorded = step == 0 and not rollout.editor.operations
+        colors = self.opened.first_colors if is_as_recorded else self.opened.colors(state)
         with self.lock:
             rollout.colors[step] = colors
         return state, colors
 
+    def _at(self, step: int, of_kept: bool) -> tuple[Rollout, int]:
+        rollout = self.kept if of_kept and self.kept is not None else self.now
+        return rollout, min(max(step, 0), rollout.num_steps)
+
     def render(self, step: int, cameras: Cameras, of_kept: bool = False) -> UInt8[NDArray, "view height width 3"]:
         """Render a state from cameras (axis ``view``)."""
-        state, _ = self.shown(step, of_kept)
+        state = self.shown_state(step, of_kept)
         return to_uint8(self.opened.simulator.render([state], cameras)[0])
 
     def measure(self, step: int, view: int, image: UInt8[NDArray, "height width 3"]) -> dict[str, float]:
@@ -170,7 +179,7 @@ class Session:
 
         What lies behind the recording has no truth and gives none; an edited scene is held against the unedited truth.
         """
-        state, _ = self.shown(step)
+        state = self.shown_state(step)
         figures = {"particles": float(state.mask.sum())}
         if step <= self.opened.num_true_steps:
             pair = (

@@ -1,0 +1,18 @@
+"""Every row of the table of recipes is a training that can be configured."""
+
+import pytest
+
+from benchmarks.recipes import RECIPES, TRAINING, main
+from vpd_lightning.config import compose
+
+
+@pytest.mark.parametrize("row", RECIPES)
+def test_each_row_changes_what_it_says(row: str) -> None:
+    base = compose("train", list(TRAINING))
+    changed = compose("train", [*TRAINING, *RECIPES[row]])
+    assert (changed == base) == (row == "base")
+
+
+def test_unknown_rows_are_refused(tmp_path) -> None:
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), "--rows", "nothing"])
