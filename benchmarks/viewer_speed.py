@@ -43,8 +43,8 @@ def first_picture(browser: Any) -> tuple[float, float]:
         assert process.stdout is not None
         url = next(found.group() for line in process.stdout if (found := re.search(r"http://127\S+", line)))
         page.goto(url)
-        # The page handles messages in order, and this line is sent behind the points.
-        page.get_by_text(re.compile(r"\d+ particles")).first.wait_for(timeout=120_000)
+        # The page handles messages in order, and the panel's title is sent behind the points.
+        page.get_by_text("frame 0").first.wait_for(timeout=120_000)
         particles = time.perf_counter() - start
         page.get_by_text("PSNR").first.wait_for(timeout=120_000)
         return particles, time.perf_counter() - start

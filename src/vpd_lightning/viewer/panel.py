@@ -18,6 +18,7 @@ from vpd_lightning.viewer.scene_drawing import SceneDrawing
 from vpd_lightning.viewer.session import Session
 
 MODES = ("particles", "rendered", "both")
+_POINT_SIZE = 1.5  # centimetres
 
 
 class Panel:
@@ -33,6 +34,8 @@ class Panel:
         self._looks_through: int | None = None
         gui: Any = client.gui
         gui.configure_theme(show_share_button=False, control_width="medium")
+        self.look_through(opened.input_views[0])
+        self.drawing.first_particles(_POINT_SIZE / 100)  # the buttons and the renderer's colours take a second more
         gui.add_markdown(f"**{opened.title}**")
         with gui.add_folder("Rollout"):
             self.step = gui.add_slider("step", 0, 1, 1, 0, disabled=True)
@@ -55,16 +58,13 @@ class Panel:
         self.simulate.on_click(lambda _: self.act(self.run_simulation))
         client.camera.on_update(lambda _: self.ask_picture())
         threading.Thread(target=self._play, daemon=True, name="vpd-view playing").start()
-        self.look_through(opened.input_views[0])
-        self.drawing.first_particles(self.point_size.value / 100)  # the renderer's colours take a second more
-        self.figures.content = self._step_line(0)
         self.redraw()
 
     def _add_view_tab(self) -> None:
         gui: Any = self.client.gui
         self.mode = gui.add_dropdown("show", MODES, initial_value="particles")
         self.rows = gui.add_slider("rows of the picture", 32, 768, 16, 256)
-        self.point_size = gui.add_slider("point size (cm)", 0.2, 10.0, 0.1, 1.5)
+        self.point_size = gui.add_slider("point size (cm)", 0.2, 10.0, 0.1, _POINT_SIZE)
         self.cameras_shown = gui.add_checkbox("cameras", True)
         self.truth_shown = gui.add_checkbox("measured points", False)
         look = gui.add_dropdown(
@@ -186,17 +186,13 @@ class Panel:
         known = step <= self.opened.num_true_steps
         self.true_image.image = self.opened.truth[step, view] if known else np.zeros_like(image)
         figures = self.session.measure(step, view, image)
-        lines = [self._step_line(step)]
+        lines = [f"step **{step}** of {self.session.now.num_steps}, {int(figures['particles'])} particles"]
         if known:
             lines.append(f"camera {view}: PSNR **{figures['psnr']:.2f} dB**")
             lines.append(f"to measured points: **{100 * figures['chamfer']:.1f} cm** (Chamfer)")
         else:
             lines.append("behind the end of the recording")
         self.figures.content = "  \n".join(lines)
-
-    def _step_line(self, step: int) -> str:
-        num_particles = int(self.session.shown_state(step).mask.sum())
-        return f"step **{step}** of {self.session.now.num_steps}, {num_particles} particles"
 
     def viewpoint(self) -> Viewpoint:
         """Return the browser's camera."""
