@@ -2,6 +2,8 @@
 
 import json
 import statistics
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tests.reliability.outcome import Outcome
@@ -12,20 +14,24 @@ MAX_GROWTH = 0.01
 
 
 def memory(work: Path, *, num_steps: int = 1000, num_rollouts: int = 500) -> list[Outcome]:
-    """Compare the second tenth of a long run with its last tenth, for each model."""
+    """Compare the second tenth of a long run with its last tenth, for each model; two models at a time."""
     data = make_data(work / "data")
-    trained, rolled = [], []
-    for model in MODELS:
-        folder = work / f"memory_{model}"
-        # No validation and one checkpoint at the end: what a step holds, not what a validation adds.
-        training = words(data, folder, num_steps, f"model={model}", "callbacks.keep_checkpoints.every_n_steps=100000")
-        training.append("trainer.val_check_interval=100000")
-        trained.append(_growth(_measured("train", num_steps, *training)))
-        rolled.append(_growth(_measured("rollouts", num_rollouts, str(folder), str(data))))
+    with ThreadPoolExecutor(len(MODELS)) as pool:
+        jobs = [pool.submit(_of_model, model, data, work, num_steps, num_rollouts) for model in MODELS]
+        trained, rolled = zip(*(job.result() for job in jobs), strict=True)
     return [
         _outcome(f"memory was flat over {num_steps:,} training steps", trained),
         _outcome(f"memory was flat over {num_rollouts} rollouts", rolled),
     ]
+
+
+def _of_model(model: str, data: Path, work: Path, num_steps: int, num_rollouts: int) -> tuple[float, float]:
+    folder = work / f"memory_{model}"
+    # No validation and one checkpoint at the end: what a step holds, not what a validation adds.
+    training = words(data, folder, num_steps, f"model={model}", "callbacks.keep_checkpoints.every_n_steps=100000")
+    training.append("trainer.val_check_interval=100000")
+    trained = _growth(_measured("train", num_steps, *training))
+    return trained, _growth(_measured("rollouts", num_rollouts, str(folder), str(data)))
 
 
 def _measured(what: str, count: int, *rest: str) -> list[int]:
@@ -42,6 +48,6 @@ def _growth(found: list[int]) -> float:
     return statistics.median(found[-tenth:]) / statistics.median(found[tenth : 2 * tenth]) - 1
 
 
-def _outcome(promise: str, growths: list[float]) -> Outcome:
+def _outcome(promise: str, growths: Sequence[float]) -> Outcome:
     seen = ", ".join(f"{model} {100 * growth:+.2f} %" for model, growth in zip(MODELS, growths, strict=True))
     return Outcome(promise, len(growths), sum(growth < MAX_GROWTH for growth in growths), seen)
