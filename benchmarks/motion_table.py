@@ -28,18 +28,18 @@ FORMS = {
 }  # fmt: skip
 
 
-def read_runs(folder: Path) -> dict[str, dict[str, dict[int, Metrics]]]:
-    """Return the metrics by data set, system and seed.
+def read_runs(folder: Path, evaluation: str = "evaluation") -> dict[str, dict[str, dict[int, Metrics]]]:
+    """Return the metrics by data set, system and seed; ``evaluation`` is the folder's name in each run.
 
     Raises:
         FileNotFoundError: there are none.
     """
     found: dict[str, dict[str, dict[int, Metrics]]] = defaultdict(lambda: defaultdict(dict))
-    for path in sorted(folder.glob("*/*/evaluation/metrics.json")):
+    for path in sorted(folder.glob(f"*/*/{evaluation}/metrics.json")):
         system, _, seed = path.parents[1].name.rpartition("_")
         found[path.parents[2].name][system][int(seed)] = json.loads(path.read_text())
     if not found:
-        raise FileNotFoundError(f"{folder} holds no EXPERIMENT/SYSTEM_SEED/evaluation/metrics.json")
+        raise FileNotFoundError(f"{folder} holds no EXPERIMENT/SYSTEM_SEED/{evaluation}/metrics.json")
     return found
 
 
@@ -105,11 +105,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and, with ``--out``, write its numbers as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--evaluation", default="evaluation", help="evaluation_validation for the validation split")
     parser.add_argument("--out", type=Path, help="JSON file of the numbers of every run")
     names = sorted({*COLUMNS, *FORMS})
     parser.add_argument("--columns", nargs="+", default=COLUMNS, choices=names, metavar="COLUMN", help=", ".join(names))
     options = parser.parse_args(arguments)
-    runs = read_runs(options.folder)
+    runs = read_runs(options.folder, options.evaluation)
     print(table(runs, options.columns))
     if options.out:
         content = {

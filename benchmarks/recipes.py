@@ -1,8 +1,8 @@
 """What each part of the training recipe buys: ``python -m benchmarks.recipes FOLDER [--rows NAME,...] [--seeds 0,1]``.
 
 Trains ``model=inertial`` on MuJoCo Block for an equal number of updates, once for each row and seed, and measures it on
-the validation split; ``python -m benchmarks.motion_table FOLDER`` brings the figures together. What is done already is
-left as it is, and what was killed goes on. Two runs share two cores (``--beside``).
+the validation split; ``python -m benchmarks.motion_table FOLDER --evaluation evaluation_validation`` brings the figures
+together. What is done already is left as it is, and what was killed goes on. Two runs share two cores (``--beside``).
 """
 
 import argparse
@@ -40,7 +40,7 @@ RECIPES: dict[str, tuple[str, ...]] = {
 def measure(folder: Path, row: str, seed: int, threads: int) -> str:
     """Train one row with one seed and evaluate it; returns what to print."""
     run = folder / "mujoco_block" / f"{row}_{seed}"
-    if (run / "evaluation" / "metrics.json").is_file():
+    if (run / "evaluation_validation" / "metrics.json").is_file():
         return f"{row} {seed}: done before"
     words = [*TRAINING, f"trainer.max_steps={UPDATES}", f"seed={seed}", f"run.folder={run}", *RECIPES[row]]
     for command, arguments in (
