@@ -19,7 +19,7 @@ STAMP := $(VENV)/.installed
 
 export MPLBACKEND = Agg
 
-.PHONY: view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-all test-fast check format format-check lint \
+.PHONY: view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
 	types imports docs cluster bench stability paper-step wheel clean
 
 help: ## List the targets
@@ -74,11 +74,8 @@ novel-view-figure: $(STAMP) ## Draw the paper's novel-view figure: a ring of cam
 	$(BIN)/vpd-data generate scene=deformable_collision preset=tiny out=$(EDIT_DATA) seed=0
 	$(BIN)/vpd-render ckpt=released/deformable_collision_inertial data.folder=$(EDIT_DATA) freeze_step=15 camera=ring num_views=8 out=$(call NEW_FOLDER,runs/novel_view_figure)
 
-test: $(STAMP) ## Run the tests but those that only repeat others on more cases (no GPU, no torch-cluster; about 25 minutes on two cores)
+test: $(STAMP) ## Run all tests, of the stability matrix a part that covers it (no GPU, no torch-cluster; about 15 minutes on two cores)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m "not exhaustive" --durations=15 --durations-min=5
-
-test-all: $(STAMP) ## Run all tests, the exhaustive ones too
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 test-fast: $(STAMP) ## Run the tests that are not marked slow, without the stability matrix (under 2 minutes)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" --ignore=tests/stability

@@ -111,13 +111,8 @@ def test_correct_data_have_no_fault(tmp_path: Path, sensor: str, seed: int):
         assert faults == []
 
 
-_RARELY = ("holes", "whole millimetres", "noise")  # parts of "all of it"
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "sensor", [pytest.param(name, marks=[pytest.mark.exhaustive] if name in _RARELY else []) for name in SENSORS]
-)
+@pytest.mark.parametrize("sensor", SENSORS)
 def test_correct_data_of_many_scenes_have_no_fault(tmp_path: Path, sensor: str):
     for seed in range(20, 35):
         shape = {"num_views": 2 + seed % 4} if seed % 3 else {"num_views": 1, "num_frames": 9, "is_moving": True}

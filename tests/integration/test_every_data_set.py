@@ -16,11 +16,7 @@ NEEDS_GL = [
     "deformable_block", "deformable_multi", "deformable_collision",
     "movi_a", "movi_b", "movi_c", "movi_a_high", "movi_c_high",
 ]  # fmt: skip
-OFTEN = ("deformable_multi", "movi_c")  # one of each family in every run of the tests
-EXPERIMENTS = [
-    "mujoco_block",
-    *(pytest.param(n, marks=[pytest.mark.gl, *([] if n in OFTEN else [pytest.mark.exhaustive])]) for n in NEEDS_GL),
-]
+EXPERIMENTS = ["mujoco_block", *(pytest.param(name, marks=pytest.mark.gl) for name in NEEDS_GL)]
 SMALL = {
     "splits.train": 2, "splits.validation": 1, "splits.test": 1,
     "num_frames": 6, "camera.height": 32, "camera.width": 32,
