@@ -74,7 +74,7 @@ novel-view-figure: $(STAMP) ## Draw the paper's novel-view figure: a ring of cam
 	$(BIN)/vpd-data generate scene=deformable_collision preset=tiny out=$(EDIT_DATA) seed=0
 	$(BIN)/vpd-render ckpt=released/deformable_collision_inertial data.folder=$(EDIT_DATA) freeze_step=15 camera=ring num_views=8 out=$(call NEW_FOLDER,runs/novel_view_figure)
 
-test: $(STAMP) ## Run all tests, of the stability matrix a part that covers it (no GPU, no torch-cluster; about 15 minutes on two cores)
+test: $(STAMP) ## Run all tests, of the stability matrix a part that covers it (no GPU, no torch-cluster; about 25 minutes on two cores)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m "not exhaustive" --durations=15 --durations-min=5
 
 test-fast: $(STAMP) ## Run the tests that are not marked slow, without the stability matrix (under 2 minutes)

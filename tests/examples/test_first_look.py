@@ -25,9 +25,9 @@ def test_the_notebook_is_committed_without_outputs(notebook: Any) -> None:
 def test_the_notebook_runs(notebook: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     monkeypatch.setenv("JUPYTER_RUNTIME_DIR", str(tmp_path / "runtime"))
-    monkeypatch.delenv("MPLBACKEND", raising=False)  # other tests' programs set it, and no picture would be shown
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # `make test` sets it, and no picture would be shown
     place = {"metadata": {"path": str(tmp_path)}}
-    NotebookClient(notebook, timeout=400, startup_timeout=400, resources=place).execute()
+    NotebookClient(notebook, timeout=90, resources=place).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     pictures = [output for output in outputs if "image/png" in output.get("data", {})]
     assert len(pictures) == 5, "inputs, prediction, ring, particles, distances"
