@@ -8,6 +8,8 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from vpd_lightning.moved import install as _find_moved_modules
+
 if TYPE_CHECKING:
     from vpd_lightning.editing.scene_editor import SceneEditor
     from vpd_lightning.loading import load
@@ -18,6 +20,8 @@ try:
     __version__ = version("vpd-lightning")
 except PackageNotFoundError:  # a checkout on the path that was never installed
     __version__ = "0+unknown"
+
+_find_moved_modules()
 
 _HOMES = {
     "Cameras": "vpd_lightning.types",

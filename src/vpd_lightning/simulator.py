@@ -15,7 +15,16 @@ from vpd_lightning.geometry.cameras import pixel_rays
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.system import AbstractSystem
-from vpd_lightning.types import Cameras, Particles, Rays, RenderedRays, RGBDFrames, SimulatorOutput, VideoBatch
+from vpd_lightning.types import (
+    NUM_CONTEXT_FRAMES,
+    Cameras,
+    Particles,
+    Rays,
+    RenderedRays,
+    RGBDFrames,
+    SimulatorOutput,
+    VideoBatch,
+)
 
 
 @dataclass(frozen=True)
@@ -61,7 +70,7 @@ class Simulator(AbstractSystem):
     bodies.
     """
 
-    num_context_frames = 2
+    num_context_frames = NUM_CONTEXT_FRAMES
 
     def __init__(
         self,

@@ -11,6 +11,9 @@ from torch import Tensor
 from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.randomness import RandomKeys
 
+NUM_CONTEXT_FRAMES = 2
+"""Observed frames that a model of particles starts from: two give each particle a position and a velocity."""
+
 Border = TypeVar("Border", bound="_Border")
 
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from vpd_lightning.config import compose
-from vpd_lightning.dynamics.first_velocity import FirstVelocity
 from vpd_lightning.dynamics.hierarchical_gnn import HierarchicalGNNDynamics
+from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity
 from vpd_lightning.dynamics.velocity_gnn import VelocityGNNDynamics, VelocityMemory
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.testing.scenes import ball_particles, keys_for

@@ -8,7 +8,7 @@ from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.bounds import early_stop_error
 from vpd_lightning.renderer.early_stop import front_to_back
 from vpd_lightning.renderer.point_nerf import PointNeRFRenderer
-from vpd_lightning.renderer.volumetric import ray_weights
+from vpd_lightning.renderer.rays.volumetric import ray_weights
 from vpd_lightning.types import Particles
 
 NEAR, FAR = 0.5, 4.0

@@ -5,7 +5,7 @@ import torch
 
 from tests.renderer.small_renderer import assert_same, gradients_of, rays_of, renderer_of, scene
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.renderer.radiance_field import RadianceField
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 from vpd_lightning.renderer.row_sharing import SharedRows
 
 TIGHT = {"max_radius": 0.25}

@@ -5,6 +5,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from vpd_lightning.errors import ConfigError
+from vpd_lightning.moved import current_name
 
 _RENDERER = "vpd_lightning.renderer."
 _DYNAMICS = "vpd_lightning.dynamics."
@@ -44,11 +45,13 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
 
 
 def upgraded(config: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Return a stored configuration with the settings added that its classes have got since; values given stay."""
+    """Return a stored configuration with today's names of its classes and the settings they got since; values stay."""
     result = {}
     for name, section in config.items():
         if isinstance(section, Mapping):
             section = upgraded(section)
+            if isinstance(section.get("_target_"), str):
+                section["_target_"] = current_name(section["_target_"])
             section = {**ADDED_SETTINGS.get(str(section.get("_target_")), {}), **section}
         result[name] = section
     return result

@@ -8,9 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Cameras, Rays, RGBDFrames, VideoBatch
-
-NUM_CONTEXT_FRAMES = 2
+from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras, Rays, RGBDFrames, VideoBatch
 
 
 @dataclass(frozen=True)

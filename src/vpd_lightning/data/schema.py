@@ -12,8 +12,6 @@ Readable with h5py alone::
                  depth_type = "z", source_depth_type, seed, engine, scene_hash
 """
 
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +20,8 @@ from typing import Any
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+
+from vpd_lightning.files import AtomicPath
 
 SCHEMA_VERSION = 1
 DEPTH_TYPE = "z"
@@ -40,7 +40,6 @@ STATE_TETRAHEDRA = "tetrahedra"  # (element, 4) int32, indices into vertices
 COMPRESSIONS = ("gzip", "lzf", "none")
 _GZIP_LEVEL = 1  # level 4 takes 1.5 times as long to write and saves a sixth
 DEPTH_ENCODINGS = ("float32", "uint16")
-PARTIAL_SUFFIX = ".partial"
 _UINT16_STEPS = 65534  # 0 means no measurement, 1..65535 cover [near, far of the data]
 
 
@@ -153,40 +152,3 @@ def _write_images(group: h5py.Group, name: str, images: NDArray[Any], compressio
         shuffle=images.dtype.itemsize > 1,
         fletcher32=True,
     )
-
-
-class AtomicPath:
-    """Context manager: gives a temporary path beside ``path``, which becomes ``path`` when the block succeeds.
-
-    What was written is flushed to disk before the rename; after an exception the temporary file is gone and ``path`` is
-    as it was.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.partial: Path | None = None
-
-    def __enter__(self) -> Path:
-        handle, name = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.", suffix=PARTIAL_SUFFIX)
-        os.close(handle)
-        self.partial = Path(name)
-        return self.partial
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        assert self.partial is not None
-        try:
-            if kind is None:
-                self.partial.chmod(0o644)
-                _flush(self.partial)
-                os.replace(self.partial, self.path)
-                _flush(self.path.parent)
-        finally:
-            self.partial.unlink(missing_ok=True)
-
-
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

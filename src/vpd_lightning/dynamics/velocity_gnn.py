@@ -7,7 +7,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from vpd_lightning.dynamics.base import AbstractDynamics
-from vpd_lightning.dynamics.first_motion import (
+from vpd_lightning.dynamics.hierarchical_gnn import HierarchicalGNNDynamics
+from vpd_lightning.dynamics.inertial.first_motion import (
     FirstMotion,
     find_first_motion,
     gather_index,
@@ -16,8 +17,7 @@ from vpd_lightning.dynamics.first_motion import (
     put,
     take,
 )
-from vpd_lightning.dynamics.first_velocity import FirstVelocity
-from vpd_lightning.dynamics.hierarchical_gnn import HierarchicalGNNDynamics
+from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity
 from vpd_lightning.graph.neighbors import knn
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles

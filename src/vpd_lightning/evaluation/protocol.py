@@ -1,23 +1,14 @@
-"""What an evaluation asks for, and one held-out clip as it is read from disk."""
+"""What an evaluation predicts and counts."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from jaxtyping import Float, UInt8
-from numpy.typing import NDArray
-from torch import Tensor
-
-from vpd_lightning.data.ground_truth import GroundTruth, has_state, read_state
+from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import SPLITS
-from vpd_lightning.data.reader import TrajectoryReader
-from vpd_lightning.errors import ConfigError, DataError
-from vpd_lightning.types import Cameras
-
-NUM_CONTEXT = 2
+from vpd_lightning.errors import ConfigError
+from vpd_lightning.types import NUM_CONTEXT_FRAMES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,107 +54,8 @@ class Protocol:
         return {**asdict(self), "start_frames": list(self.start_frames)}
 
 
-@dataclass(frozen=True)
-class Clip:
-    """The frames that a model is shown and those to predict, all cameras; colours are uint8, z-depth is in metres.
-
-    ``cameras`` holds those of the context (axes ``time view``), ``target_cameras`` those of the predicted frames. The
-    context ends with frame ``start + 1``; it begins with frame ``start`` for a model that sees two frames, and earlier
-    for one that sees more.
-    """
-
-    name: str
-    trajectory: int
-    start: int
-    rgb: UInt8[Tensor, "time view height width 3"]
-    depth: Float[Tensor, "time view height width"]
-    cameras: Cameras
-    target_rgb: UInt8[Tensor, "step view height width 3"]
-    target_depth: Float[Tensor, "step view height width"]
-    target_cameras: Cameras
-    workspace_min: tuple[float, float, float]
-    workspace_max: tuple[float, float, float]
-    frame_time: float
-    state: GroundTruth | None
-
-    @property
-    def current_frame(self) -> int:
-        """The last input frame; predicted step ``h`` (from 0) is frame ``current_frame + 1 + h``."""
-        return self.start + NUM_CONTEXT - 1
-
-    def poses(self, num_steps: int) -> Float[Tensor, "time object 7"]:
-        """True poses from the last input frame on, at most ``num_steps`` steps (fewer where the recording ends)."""
-        assert self.state is not None
-        window = slice(self.current_frame, self.current_frame + num_steps + 1)
-        poses = np.concatenate([self.state.positions[window], self.state.quaternions[window]], axis=-1)
-        return torch.from_numpy(poses)
-
-    def previous_pose(self) -> Float[Tensor, "object 7"]:
-        """True poses at the frame before the last input frame."""
-        assert self.state is not None
-        frame = self.current_frame - 1
-        return torch.from_numpy(np.concatenate([self.state.positions[frame], self.state.quaternions[frame]], axis=-1))
-
-
-def read_cameras(reader: TrajectoryReader, times: Sequence[int], views: Sequence[int]) -> Cameras:
-    """Return the cameras of some frames and views (axes ``time view``) in float32."""
-    intrinsics, cam_to_world = reader.cameras(times, views)
-    return Cameras(_float32(intrinsics), _float32(cam_to_world), reader.height, reader.width)
-
-
-def read_clip(
-    path: Path,
-    trajectory: int,
-    start: int,
-    num_steps: int,
-    with_state: bool = True,
-    num_context: int = NUM_CONTEXT,
-) -> Clip:
-    """Read one clip of a trajectory, with the last ``num_context`` frames up to frame ``start + 1`` as its context.
-
-    Raises:
-        DataError: the recording is too short for it.
-        ConfigError: there are fewer frames before the predicted ones than the context needs.
-    """
-    first = start + NUM_CONTEXT - num_context
-    if first < 0:
-        raise ConfigError(
-            f"The model looks at {num_context} frames, but start frame {start} has only {start + NUM_CONTEXT} up to "
-            f"its last input frame.\nStart later: protocol.start_frames=[{num_context - NUM_CONTEXT}]"
-        )
-    with TrajectoryReader(path) as reader:
-        last = start + NUM_CONTEXT + num_steps - 1
-        if last >= reader.num_frames:
-            raise DataError(
-                f"{path} has {reader.num_frames} frames; start frame {start} with {num_steps} steps needs "
-                f"{last + 1}.\nLower num_steps to {max(reader.num_frames - start - NUM_CONTEXT, 0)} or fewer, or start "
-                "earlier."
-            )
-        views = range(reader.num_views)
-        context, targets = range(first, start + NUM_CONTEXT), range(start + NUM_CONTEXT, last + 1)
-        return Clip(
-            name=f"{path.parent.name}/{path.name}@{start}",
-            trajectory=trajectory,
-            start=start,
-            rgb=torch.from_numpy(reader.rgb(context, views)),
-            depth=torch.from_numpy(reader.depth(context, views)),
-            cameras=read_cameras(reader, context, views),
-            target_rgb=torch.from_numpy(reader.rgb(targets, views)),
-            target_depth=torch.from_numpy(reader.depth(targets, views)),
-            target_cameras=read_cameras(reader, targets, views),
-            workspace_min=reader.workspace_min,
-            workspace_max=reader.workspace_max,
-            frame_time=reader.frame_time,
-            state=read_state(path) if with_state and has_state(path) else None,
-        )
-
-
-def read_clips(paths: Sequence[Path], protocol: Protocol, num_context: int = NUM_CONTEXT) -> Iterator[Clip]:
+def read_clips(paths: Sequence[Path], protocol: Protocol, num_context: int = NUM_CONTEXT_FRAMES) -> Iterator[Clip]:
     """Read the clips of the protocol one after the other: every start frame of the first trajectory, then the next."""
     for trajectory, path in enumerate(paths[: protocol.num_trajectories]):
         for start in protocol.start_frames:
             yield read_clip(path, trajectory, start, protocol.num_steps, num_context=num_context)
-
-
-def _float32(array: NDArray[np.float64]) -> Tensor:
-    return torch.from_numpy(array.astype(np.float32))

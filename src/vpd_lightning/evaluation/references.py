@@ -11,7 +11,7 @@ from torch import Tensor
 from vpd_lightning.data.ground_truth import read_positions
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.errors import DataError
-from vpd_lightning.evaluation.protocol import NUM_CONTEXT
+from vpd_lightning.types import NUM_CONTEXT_FRAMES
 
 _NUM_ITERATIONS = 100
 _SOFTENING = 1e-4  # m
@@ -53,7 +53,7 @@ def median_displacements(
         if positions is None:
             continue
         for start in start_frames:
-            current = start + NUM_CONTEXT - 1
+            current = start + NUM_CONTEXT_FRAMES - 1
             if len(positions) > current + num_steps:
                 displacements[start].append(positions[current + 1 : current + 1 + num_steps] - positions[current])
     return {

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vpd_lightning.renderer.precision import at_least_float32, full_precision
+from vpd_lightning.renderer.field.precision import at_least_float32, full_precision
 
 Evaluate = Callable[[Tensor, slice], tuple[Tensor, Tensor]]
 """From indices of rays and a slice of their samples to densities (``ray sample``) and colours (``ray sample 3``)."""

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vpd_lightning.renderer.radiance_field import RadianceField
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 
 
 class SharedRows:
