@@ -26,9 +26,9 @@ def _run(words: list[str]) -> int:
 def _render(config: Mapping[str, Any]) -> None:
     import torch
 
-    from vpd_lightning.commands.eval import set_threads
     from vpd_lightning.commands.one_recording import choose_trajectory, data_set, load_particle_simulator
     from vpd_lightning.commands.progress import show_progress
+    from vpd_lightning.commands.threads import set_threads
     from vpd_lightning.data.manifest import file_sha256
     from vpd_lightning.editing.colored_editor import colored_editor
     from vpd_lightning.editing.edit_files import load_edit, replay

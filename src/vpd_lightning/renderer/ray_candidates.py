@@ -10,7 +10,8 @@ from torch import Tensor
 from vpd_lightning.renderer.neighbor_features import NeighborFeatures
 from vpd_lightning.renderer.point_features import kernel_weights, safe_norm
 from vpd_lightning.renderer.precision import at_least_float32, full_precision
-from vpd_lightning.renderer.ray_search import BesideRay, Candidates, RaySearch, resolved_backend
+from vpd_lightning.renderer.ray_scores import BesideRay
+from vpd_lightning.renderer.ray_search import Candidates, RaySearch, resolved_backend
 from vpd_lightning.types import Particles, Rays
 
 
