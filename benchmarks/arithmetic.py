@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from benchmarks.plain.neighbors import nearest, pairs_within
 from vpd_lightning.dynamics.hierarchical_gnn import HierarchicalGNNDynamics
 from vpd_lightning.encoder.unet import UNetEncoder
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 from vpd_lightning.renderer.point_nerf import PointNeRFRenderer
-from vpd_lightning.renderer.radiance_field import RadianceField
 from vpd_lightning.renderer.surface import SurfaceRenderer
 from vpd_lightning.types import Particles
 

@@ -18,7 +18,7 @@ from benchmarks.training_step import EDGES_PER_NODE, PAPER, TINY, Scale, Step
 from benchmarks.worlds import picture_rays, surface_particles, two_frames
 from vpd_lightning.graph.neighbors import PointIndex
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.renderer.fused_features import fused_annular_features
+from vpd_lightning.renderer.kernels.fused_features import fused_annular_features
 from vpd_lightning.types import Particles
 
 KEYS = RandomKeys.fixed(1)

@@ -51,8 +51,8 @@ class Model:
 
     def clip(self, num_steps: int, trajectory: int = 0) -> Any:
         """Read the first clip of a trajectory of the test split."""
+        from vpd_lightning.data.clip import read_clip
         from vpd_lightning.data.manifest import load_manifest
-        from vpd_lightning.evaluation.protocol import read_clip
 
         paths = load_manifest(self.data).split("test")
         start = (self.config.get("protocol") or {}).get("start_frames") or [0]

@@ -20,12 +20,12 @@ from benchmarks.measuring import Result, Row, interleaved, row, seconds_now
 from benchmarks.results_files import default_folder, write
 from vpd_lightning.config import build, compose
 from vpd_lightning.config.sleeping import with_sleeping
+from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.sleeping import SleepingDynamics
-from vpd_lightning.evaluation.clip import encode_clip
 from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
-from vpd_lightning.evaluation.protocol import Clip, read_clip
+from vpd_lightning.evaluation.prediction import encode_clip
 from vpd_lightning.loading import load_model
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.simulator import Scene, Simulator

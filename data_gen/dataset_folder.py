@@ -13,8 +13,8 @@ from typing import Any
 from data_gen.settings import differences, settings_hash
 from vpd_lightning.data.manifest import FILE_NAME, SPLITS, UNFINISHED_NAME, Manifest, load_manifest, write_manifest
 from vpd_lightning.data.reader import TrajectoryReader
-from vpd_lightning.data.schema import PARTIAL_SUFFIX, AtomicPath
 from vpd_lightning.errors import DataError
+from vpd_lightning.files import PARTIAL_SUFFIX, AtomicPath
 
 _DISK_RESERVE = 64 * 2**20
 

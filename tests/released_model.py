@@ -9,7 +9,7 @@ import torch
 
 from tests.evaluation.untrained_model import write_untrained
 from vpd_lightning.config import build_simulator, compose
-from vpd_lightning.export.release_folder import sha256
+from vpd_lightning.release.release_folder import sha256
 from vpd_lightning.simulator import Simulator
 from vpd_lightning.training.checkpoint_files import write_checkpoint
 from vpd_lightning.types import Cameras

@@ -10,8 +10,8 @@ import torch
 import vpd_lightning as vpd
 from tests.evaluation.tossed_box import write_tossed_boxes
 from tests.evaluation.untrained_model import write_untrained
-from vpd_lightning.evaluation.clip import encode_clip
-from vpd_lightning.evaluation.protocol import read_clip
+from vpd_lightning.data.clip import read_clip
+from vpd_lightning.evaluation.prediction import encode_clip
 from vpd_lightning.simulator import Scene, Simulator
 
 NUM_STEPS = 5

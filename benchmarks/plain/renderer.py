@@ -6,10 +6,10 @@ from torch import Tensor
 from benchmarks.plain.neighbors import nearest
 from vpd_lightning.geometry.ray_sampling import even_quantiles, sample_pdf, stratified_samples
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.renderer.chunked_rays import uniform_draws
+from vpd_lightning.renderer.field.positional_encoding import positional_encoding
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 from vpd_lightning.renderer.point_nerf import PointNeRFRenderer
-from vpd_lightning.renderer.positional_encoding import positional_encoding
-from vpd_lightning.renderer.radiance_field import RadianceField
+from vpd_lightning.renderer.rays.chunked_rays import uniform_draws
 from vpd_lightning.types import Particles, Rays, RenderedRays
 
 

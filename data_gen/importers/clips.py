@@ -8,8 +8,8 @@ import numpy as np
 
 from data_gen.importers.recording import MIN_FRAMES, Recording
 from data_gen.importers.settings import ImportSettings
+from data_gen.inspection.split import share
 from vpd_lightning.data.manifest import SPLITS
-from vpd_lightning.data.split import share
 from vpd_lightning.errors import DataError
 
 _MAX_REMARKS = 4  # about single recordings

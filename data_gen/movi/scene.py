@@ -9,7 +9,6 @@ from importlib.metadata import version
 
 import numpy as np
 
-from data_gen.filming import film, trajectory_of
 from data_gen.movi.catalogue import Catalogue
 from data_gen.movi.model import compile_model, labels_of
 from data_gen.movi.settings import MoviSettings
@@ -18,6 +17,7 @@ from data_gen.movi.throwing import draw_objects, place
 from data_gen.renderers import open_renderer
 from data_gen.rigid_bodies import RigidBodies
 from data_gen.settings import SPLIT_CODES
+from data_gen.simulate_and_render import film, trajectory_of
 from data_gen.stage_clock import StageClock
 from vpd_lightning.data import schema
 

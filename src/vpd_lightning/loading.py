@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from vpd_lightning.errors import CheckpointError, ConfigError
-from vpd_lightning.export.release_folder import is_release, read_release
+from vpd_lightning.release.release_folder import is_release, read_release
 
 _PREFIX = "simulator."
 

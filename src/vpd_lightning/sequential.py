@@ -16,7 +16,7 @@ from vpd_lightning.encoder.base import AbstractEncoder
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
-from vpd_lightning.renderer.sample_features import SampleFeatures
+from vpd_lightning.renderer.features.sample_features import SampleFeatures
 from vpd_lightning.simulator import Simulator
 from vpd_lightning.types import Particles, RGBDFrames, SimulatorOutput, VideoBatch
 

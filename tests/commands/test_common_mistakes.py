@@ -16,7 +16,8 @@ import pytest
 import torch
 
 from tests.data.recordings import write_recordings
-from vpd_lightning.commands import data, eval, export, info, render, report, run_claim, train, view
+from vpd_lightning.commands import data, eval, export, info, render, report, train, view
+from vpd_lightning.runs import run_claim
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "errors.md"
 HEAD = """# Common mistakes, and what is said

@@ -14,9 +14,9 @@ from tests.evaluation.tossed_box import write_tossed_boxes
 from tests.evaluation.untrained_model import write_untrained
 from tests.released_model import write_slotformer
 from vpd_lightning.commands.eval import main
-from vpd_lightning.commands.evaluation_run import choose_protocol, run_evaluation, training_of
 from vpd_lightning.config import compose
 from vpd_lightning.errors import ConfigError
+from vpd_lightning.runs.evaluation_run import choose_protocol, run_evaluation, training_of
 from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 
@@ -161,7 +161,7 @@ def test_a_data_set_that_is_gone_is_made_again_where_the_training_would_make_it(
         asked.append(Path(config["data"]["folder"]))
         gone.symlink_to(data)
 
-    monkeypatch.setattr("vpd_lightning.commands.one_recording.provide_data", provide)
+    monkeypatch.setattr("vpd_lightning.runs.one_recording.provide_data", provide)
     code = main([f"ckpt={checkpoint}", "num_videos=0", "protocol.num_trajectories=1", "protocol.num_long_steps=0"])
     assert (code, asked) == ((0, [gone]) if is_made else (3, []))
 

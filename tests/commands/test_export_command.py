@@ -10,12 +10,12 @@ from tests.evaluation.tossed_box import write_tossed_boxes
 from tests.released_model import figures, write_run
 from vpd_lightning.commands import eval as evaluation
 from vpd_lightning.commands import export, info
+from vpd_lightning.data.clip import read_clip
 from vpd_lightning.errors import CheckpointError
-from vpd_lightning.evaluation.clip import encode_clip
-from vpd_lightning.evaluation.protocol import read_clip
-from vpd_lightning.export.release_folder import check_release, sha256
+from vpd_lightning.evaluation.prediction import encode_clip
 from vpd_lightning.geometry.cameras import pixel_rays
 from vpd_lightning.loading import load_model
+from vpd_lightning.release.release_folder import check_release, sha256
 from vpd_lightning.training.checkpoint_files import write_checkpoint
 from vpd_lightning.types import Rays
 

@@ -33,7 +33,7 @@ def test_section_becomes_an_object():
         "vpd_lightning",
         "vpd_lightning_evil.Thing",
         # Allowed packages import other modules: the path begins well and leads elsewhere.
-        "vpd_lightning.commands.environment.subprocess.Popen",
+        "vpd_lightning.runs.environment.subprocess.Popen",
         "vpd_lightning.config.run_folders.Path",
         "lightning.pytorch.trainer.trainer.os.system",
         "torch.optim.optimizer.torch.nn.Linear",

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from vpd_lightning.commands.sweeps import sweep_jobs
 from vpd_lightning.config import check_targets, check_widths, compose, config_folder, expand_sweep
 from vpd_lightning.config.run_folders import sweep_folder, sweep_slug
+from vpd_lightning.runs.sweeps import sweep_jobs
 
 SWEEPS = sorted(path.stem for path in (config_folder() / "sweep").glob("*.yaml"))
 SECTIONS = ("model", "data", "encoder", "dynamics", "renderer", "loss", "optimizer", "trainer", "callbacks", "logger")

@@ -13,15 +13,15 @@ import h5py
 import numpy as np
 import pytest
 
+from data_gen.inspection.validate import validate_dataset
 from tests.data.hostile_files import BYTE_HARMS, HARMS, flip_in
 from tests.data.recordings import make_trajectory, write_recordings
-from vpd_lightning.data.broken_file import BrokenFileError
 from vpd_lightning.data.ground_truth import has_state, read_state
-from vpd_lightning.data.hdf5_checks import checked_dataset
+from vpd_lightning.data.hdf5.broken_file import BrokenFileError
+from vpd_lightning.data.hdf5.checks import checked_dataset
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.data.schema import COMPRESSIONS, write_trajectory
-from vpd_lightning.data.validate import validate_dataset
 from vpd_lightning.errors import DataError
 
 MAX_SECONDS, MAX_MEGABYTES = 1.0, 64

@@ -6,8 +6,8 @@ import h5py
 import numpy as np
 import pytest
 
-from vpd_lightning.data.image_chunks import ImageChunks
-from vpd_lightning.data.lzf_numba import SLACK, fletcher32, unpack_lzf
+from vpd_lightning.data.hdf5.image_chunks import ImageChunks
+from vpd_lightning.data.hdf5.lzf_numba import SLACK, fletcher32, unpack_lzf
 from vpd_lightning.errors import DataError
 
 SHAPE = (3, 2, 24, 20)

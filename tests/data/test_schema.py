@@ -7,7 +7,8 @@ import pytest
 
 from tests.data.recordings import make_trajectory
 from vpd_lightning.data.reader import TrajectoryReader
-from vpd_lightning.data.schema import AtomicPath, decode_depth, encode_depth, write_trajectory
+from vpd_lightning.data.schema import decode_depth, encode_depth, write_trajectory
+from vpd_lightning.files import AtomicPath
 
 
 def test_what_is_written_is_read_back(tmp_path: Path):

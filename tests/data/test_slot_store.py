@@ -17,9 +17,9 @@ from tests.data.recordings import write_recordings
 from vpd_lightning.config import compose
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.manifest import load_manifest
-from vpd_lightning.data.slot_extraction import VIEWS_AT_ONCE, encoder_of, extract_slots, wait_for_slots
-from vpd_lightning.data.slot_store import ARRAY_FILE, INDEX_FILE, SlotSource, SlotStore
-from vpd_lightning.data.view_datamodule import FOLDER, ViewDataModule
+from vpd_lightning.data.views.slot_extraction import VIEWS_AT_ONCE, encoder_of, extract_slots, wait_for_slots
+from vpd_lightning.data.views.slot_store import ARRAY_FILE, INDEX_FILE, SlotSource, SlotStore
+from vpd_lightning.data.views.view_datamodule import FOLDER, ViewDataModule
 from vpd_lightning.errors import CheckpointError, DataError, NonFiniteError
 
 NUM_SLOTS, DIM, FRAMES, VIEWS, RESOLUTION = 3, 5, 8, 6, 16  # as the recordings: nothing is rounded

@@ -13,8 +13,8 @@ from tests.data.recordings import make_trajectory, write_recordings
 from vpd_lightning.config import compose
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.schema import write_trajectory
-from vpd_lightning.data.view_clips import ViewClipDataset, collate_views
-from vpd_lightning.data.view_datamodule import ViewDataModule
+from vpd_lightning.data.views.view_clips import ViewClipDataset, collate_views
+from vpd_lightning.data.views.view_datamodule import ViewDataModule
 from vpd_lightning.errors import ConfigError, DataError
 from vpd_lightning.types import ViewBatch
 

@@ -5,17 +5,17 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from vpd_lightning.dynamics.body_motion import BodyMotion, body_inertia, vectors_of
-from vpd_lightning.dynamics.contact import (
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, vectors_of
+from vpd_lightning.dynamics.inertial.contact import (
     ContactPoints,
     Contacts,
     ContactSolver,
     Resolved,
     nearest_body_contacts,
 )
-from vpd_lightning.dynamics.inertial import _elastic
-from vpd_lightning.dynamics.materials import Materials
-from vpd_lightning.dynamics.rigid_motion import rotate, rotation_from_spin
+from vpd_lightning.dynamics.inertial.dynamics import _elastic
+from vpd_lightning.dynamics.inertial.materials import Materials
+from vpd_lightning.dynamics.inertial.rigid_motion import rotate, rotation_from_spin
 
 FAR = 10.0
 

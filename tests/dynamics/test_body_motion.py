@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from tests.dynamics.solids import even_ball, even_cube, random_rotation, rotation_about
-from vpd_lightning.dynamics.body_motion import MAX_STRAIN, BodyMotion, Inertia, body_inertia
-from vpd_lightning.dynamics.inertial import _elastic
-from vpd_lightning.dynamics.materials import MaterialNetwork, Materials
-from vpd_lightning.dynamics.rigid_motion import rotation_from_spin
+from vpd_lightning.dynamics.inertial.body_motion import MAX_STRAIN, BodyMotion, Inertia, body_inertia
+from vpd_lightning.dynamics.inertial.dynamics import _elastic
+from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
+from vpd_lightning.dynamics.inertial.rigid_motion import rotation_from_spin
 
 EYE = torch.eye(3, dtype=torch.float64)
 

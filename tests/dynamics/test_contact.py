@@ -7,9 +7,9 @@ import torch
 
 from tests.dynamics.contact_world import World
 from tests.dynamics.solids import UP, even_ball, even_cube, rotation_about
-from vpd_lightning.dynamics.body_motion import BodyMotion, Inertia
-from vpd_lightning.dynamics.contact import ContactPoints, Contacts, ContactSolver, nearest_static_contacts
-from vpd_lightning.dynamics.materials import Materials
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia
+from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, ContactSolver, nearest_static_contacts
+from vpd_lightning.dynamics.inertial.materials import Materials
 
 EYE = torch.eye(3, dtype=torch.float64)
 

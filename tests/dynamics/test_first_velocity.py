@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from tests.dynamics.solids import ball, cube, random_rotation, rotation_about
-from vpd_lightning.dynamics.first_velocity import (
+from vpd_lightning.dynamics.inertial.first_velocity import (
     FirstVelocity,
     Poses,
     Surfels,
     body_radii,
 )
-from vpd_lightning.dynamics.rigid_motion import rotation_from_spin
+from vpd_lightning.dynamics.inertial.rigid_motion import rotation_from_spin
 
 SETTINGS = {
     "match_scales": [0.8, 0.5, 0.3, 0.18, 0.12, 0.08],

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from tests.dynamics.solids import ball, cube, random_rotation, rotation_about
-from vpd_lightning.dynamics.first_velocity import FirstVelocity
 from vpd_lightning.dynamics.inertial import InertialDynamics
-from vpd_lightning.dynamics.rigid_motion import rotation_from_spin
+from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity
+from vpd_lightning.dynamics.inertial.rigid_motion import rotation_from_spin
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.testing.contract import tensors_of
 from vpd_lightning.types import Particles

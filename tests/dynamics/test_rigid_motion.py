@@ -5,7 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.dynamics.solids import cube, rotation_about
-from vpd_lightning.dynamics.rigid_motion import (
+from vpd_lightning.dynamics.inertial.rigid_motion import (
     equidistant_centers,
     fit_twists,
     rigid_fit,

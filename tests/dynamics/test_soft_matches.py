@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.dynamics.test_first_velocity import surfels
-from vpd_lightning.dynamics.first_velocity import believed, match, point_spacing
+from vpd_lightning.dynamics.inertial.first_velocity import believed, match, point_spacing
 
 
 def test_the_best_match_of_a_point_is_the_nearest_of_its_colour():

@@ -6,11 +6,11 @@ import torch
 
 import vpd_lightning as vpd
 from tests.editing.scenes import RED, same, two_boxes
-from vpd_lightning.data.ply import write_ply
 from vpd_lightning.editing.edit_files import load_edit, load_scene, read_points, replay, save_edit, save_scene
 from vpd_lightning.editing.rotation import about_axis
 from vpd_lightning.editing.selectors import Box, Cluster, Color, Everything, Lasso, Sphere
 from vpd_lightning.errors import EditError
+from vpd_lightning.media.ply import write_ply
 
 LASSO = Lasso([[80.0, 0, 32], [0, 80, 32], [0, 0, 1]], torch.eye(4).tolist(), [[0, 0], [64, 0], [64, 64]], 5.0)
 

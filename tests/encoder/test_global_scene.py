@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from vpd_lightning.encoder.global_scene import GlobalSceneEncoder
-from vpd_lightning.encoder.resnet import ResNetTrunk
+from vpd_lightning.encoder.networks.resnet import ResNetTrunk
 from vpd_lightning.errors import DataError
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Cameras, RGBDFrames

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from vpd_lightning.dynamics.persistence import PersistenceDynamics
+from vpd_lightning.encoder.particles.wide_surface_background import WideSurfaceBackground
 from vpd_lightning.encoder.unet import UNetEncoder
-from vpd_lightning.encoder.wide_surface_background import WideSurfaceBackground
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.losses.motion import MotionLoss
 from vpd_lightning.renderer.splat import SplatRenderer

@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from vpd_lightning.encoder.background import BackgroundModel
+from vpd_lightning.encoder.networks.unet_network import UNetNetwork
+from vpd_lightning.encoder.particles.fixed_camera_background import BackgroundModel
 from vpd_lightning.encoder.unet import UNetEncoder
-from vpd_lightning.encoder.unet_network import UNetNetwork
 from vpd_lightning.errors import DataError, EmptyWorkspaceError
 from vpd_lightning.geometry.cameras import project
 from vpd_lightning.randomness import RandomKeys

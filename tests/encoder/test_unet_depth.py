@@ -9,7 +9,7 @@ from tests.encoder.test_unet import encoder as measuring_encoder
 from tests.encoder.test_unet import frames
 from tests.test_simulator import batch
 from vpd_lightning.dynamics.persistence import PersistenceDynamics
-from vpd_lightning.encoder import unprojection
+from vpd_lightning.encoder.particles import unprojection
 from vpd_lightning.encoder.unet_depth import DepthPredictingEncoder
 from vpd_lightning.errors import EmptyWorkspaceError
 from vpd_lightning.geometry.cameras import project, unproject

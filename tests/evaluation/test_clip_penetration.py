@@ -9,11 +9,11 @@ import torch
 
 from tests.evaluation.conftest import protocol_with
 from tests.evaluation.tossed_box import FLOOR_HEIGHT, HALF_SIZE, Oracle
+from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.evaluation.bodies import Body, find_bodies
 from vpd_lightning.evaluation.evaluate import evaluate
 from vpd_lightning.evaluation.penetration import clip_penetration, floor_height
-from vpd_lightning.evaluation.protocol import Clip, read_clip
 from vpd_lightning.evaluation.report import metrics_of
 from vpd_lightning.simulator import Scene
 from vpd_lightning.types import Particles

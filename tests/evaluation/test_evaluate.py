@@ -11,13 +11,14 @@ from scipy.optimize import minimize
 
 from tests.evaluation.conftest import protocol_with
 from tests.evaluation.tossed_box import NUM_FRAMES, NUM_VIEWS, SIZE, Oracle
+from vpd_lightning.data.clip import read_clip
 from vpd_lightning.data.ground_truth import read_state
 from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.errors import ConfigError, DataError
 from vpd_lightning.evaluation.evaluate import evaluate
 from vpd_lightning.evaluation.images import moving_pixels
-from vpd_lightning.evaluation.protocol import Protocol, read_clip, read_clips
+from vpd_lightning.evaluation.protocol import Protocol, read_clips
 from vpd_lightning.evaluation.references import geometric_median, median_displacements, training_mean
 from vpd_lightning.evaluation.report import metrics_of
 from vpd_lightning.metrics.psnr import PSNR_CAP

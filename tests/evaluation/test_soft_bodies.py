@@ -10,12 +10,12 @@ import torch
 
 from tests.evaluation.soft_ball import RADIUS, SoftScene, write_soft_ball
 from tests.evaluation.tossed_box import NUM_FRAMES
+from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.ground_truth import read_positions, read_state
 from vpd_lightning.errors import DataError
 from vpd_lightning.evaluation.bodies import find_bodies
 from vpd_lightning.evaluation.motion import clip_motion
 from vpd_lightning.evaluation.penetration import clip_penetration
-from vpd_lightning.evaluation.protocol import Clip, read_clip
 
 START, MARGIN = 1, 0.02
 FIRST = START + 1  # the last input frame

@@ -9,10 +9,10 @@ import torch
 import yaml
 
 from tests.released_model import cameras, synthetic_frames
-from vpd_lightning.export.card_figures import REFERENCES
-from vpd_lightning.export.portable import absolute_paths
-from vpd_lightning.export.release_folder import check_release, folder_bytes, is_release
 from vpd_lightning.loading import LoadedModel, load_model
+from vpd_lightning.release.card_figures import REFERENCES
+from vpd_lightning.release.portable import absolute_paths
+from vpd_lightning.release.release_folder import check_release, folder_bytes, is_release
 from vpd_lightning.simulator import Simulator
 from vpd_lightning.types import Cameras, RGBDFrames
 

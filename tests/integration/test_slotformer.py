@@ -12,7 +12,7 @@ from vpd_lightning.baselines.slotformer_system import SlotFormerSystem
 from vpd_lightning.commands import train
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.manifest import file_sha256, load_manifest
-from vpd_lightning.data.slot_store import SlotSource, SlotStore
+from vpd_lightning.data.views.slot_store import SlotSource, SlotStore
 from vpd_lightning.geometry.resizing import resize_images
 from vpd_lightning.loading import load_model
 from vpd_lightning.randomness import RandomKeys

@@ -6,7 +6,7 @@ import torch
 
 from tests.reference import reference_features as reference
 from vpd_lightning.graph.neighbors import Neighbors
-from vpd_lightning.renderer.point_features import annular_features
+from vpd_lightning.renderer.features.point_features import annular_features
 from vpd_lightning.types import Particles
 
 RADII, BANDWIDTHS = [0.0, 0.05, 0.1, 0.5], [0.05, 0.05, 0.05, 0.5]  # the paper's MuJoCo row

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.reference import reference_compositing as reference
-from vpd_lightning.renderer.volumetric import composite
+from vpd_lightning.renderer.rays.volumetric import composite
 
 
 def _rays(seed: int, num_rays: int = 6, num_samples: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

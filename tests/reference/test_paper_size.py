@@ -5,8 +5,8 @@ import torch
 from torch import nn
 
 from vpd_lightning.config import build_simulator, compose
-from vpd_lightning.encoder.unet_network import UNetNetwork
-from vpd_lightning.renderer.radiance_field import RadianceField
+from vpd_lightning.encoder.networks.unet_network import UNetNetwork
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 
 CHANNELS = [64, 128, 256, 512, 512, 256, 128, 64, 16]
 FEATURE, HIDDEN, STEPS, KERNELS = 16, 128, 10, 4

@@ -10,8 +10,8 @@ from torch import nn
 from tests.reference import reference_radiance_field as reference
 from tests.reference.reference_features import annular_features, nearest
 from vpd_lightning.geometry.ray_sampling import even_quantiles, stratified_samples
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 from vpd_lightning.renderer.point_nerf import PointNeRFRenderer
-from vpd_lightning.renderer.radiance_field import RadianceField
 from vpd_lightning.types import Particles, Rays
 
 RADII, BANDWIDTHS = [0.0, 0.3], [0.2, 0.4]

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from tests.reference import reference_radiance_field as reference
-from vpd_lightning.renderer.radiance_field import RadianceField
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 
 SIZES = {"input_dim": 5, "net_depth": 8, "net_width": 9, "skip_layer": 4, "net_width_condition": 6}
 

@@ -18,7 +18,7 @@ from tests.reliability.outcome import Outcome
 from tests.reliability.trainings import make_data, run, words
 from vpd_lightning.commands import export
 from vpd_lightning.errors import CheckpointError
-from vpd_lightning.export.release_folder import CONFIG_FILE, INDEX_FILE, sha256
+from vpd_lightning.release.release_folder import CONFIG_FILE, INDEX_FILE, sha256
 from vpd_lightning.training.checkpoint_files import load_checkpoint, write_checkpoint
 
 

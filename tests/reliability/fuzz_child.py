@@ -22,9 +22,9 @@ MAX_SECONDS, MAX_BYTES = 60, 8 * 2**30
 
 def read_trajectory(path: Path) -> None:
     """Read everything that a training, an evaluation or a validation reads."""
+    from data_gen.inspection.validate import validate_dataset
     from vpd_lightning.data.ground_truth import has_state, read_state
     from vpd_lightning.data.reader import TrajectoryReader
-    from vpd_lightning.data.validate import validate_dataset
 
     with TrajectoryReader(path) as reader:
         reader.rgb()

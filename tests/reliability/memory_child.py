@@ -36,7 +36,7 @@ class Weigh(pl.Callback):
 def train(words: list[str]) -> list[int]:
     """Run ``vpd-train`` with one more callback."""
     from vpd_lightning.commands import train as command
-    from vpd_lightning.commands import training_run
+    from vpd_lightning.runs import training_run
 
     found: list[int] = []
     real = training_run.build_list
@@ -55,9 +55,9 @@ def train(words: list[str]) -> list[int]:
 def rollouts(count: int, run: Path, data: Path) -> list[int]:
     """Encode, predict and render again and again."""
     import vpd_lightning
+    from vpd_lightning.data.clip import read_clip
     from vpd_lightning.data.manifest import load_manifest
-    from vpd_lightning.evaluation.clip import encode_clip
-    from vpd_lightning.evaluation.protocol import read_clip
+    from vpd_lightning.evaluation.prediction import encode_clip
 
     simulator = vpd_lightning.load(run)
     found = []

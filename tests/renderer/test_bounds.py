@@ -8,9 +8,9 @@ import torch
 from tests.renderer.small_renderer import SMALL, rays_of, renderer_of, scene
 from vpd_lightning.graph.neighbors import knn
 from vpd_lightning.renderer import bounds
-from vpd_lightning.renderer.point_features import annular_features
+from vpd_lightning.renderer.features.point_features import annular_features
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 from vpd_lightning.renderer.point_nerf import PointNeRFRenderer
-from vpd_lightning.renderer.radiance_field import RadianceField
 from vpd_lightning.types import Particles
 
 RADII, BANDWIDTHS, K = (0.0, 0.1, 0.3), (0.05, 0.1, 0.2), 5

@@ -9,9 +9,9 @@ from tests.renderer.small_renderer import SMALL, rays_of, renderer_of
 from tests.renderer.test_surface import SMALL as SMALL_SURFACE
 from vpd_lightning.graph.neighbors import Neighbors, knn
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.renderer.feature_network import FeatureNetwork
-from vpd_lightning.renderer.neighbor_features import NeighborFeatures, gathered_neighbors
-from vpd_lightning.renderer.point_features import annular_features
+from vpd_lightning.renderer.features.feature_network import FeatureNetwork
+from vpd_lightning.renderer.features.neighbor_features import NeighborFeatures, gathered_neighbors
+from vpd_lightning.renderer.features.point_features import annular_features
 from vpd_lightning.renderer.point_nerf import PointNeRFRenderer
 from vpd_lightning.renderer.surface import SurfaceRenderer
 from vpd_lightning.types import Particles, Rays

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from tests.reference import reference_features
 from vpd_lightning.graph.neighbors import Neighbors, knn
-from vpd_lightning.renderer.fused_features import fused_annular_features
-from vpd_lightning.renderer.point_features import annular_features
+from vpd_lightning.renderer.features.point_features import annular_features
+from vpd_lightning.renderer.kernels.fused_features import fused_annular_features
 from vpd_lightning.types import Particles
 
 IS_INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"

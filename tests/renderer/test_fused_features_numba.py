@@ -6,8 +6,8 @@ import torch
 
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.graph.neighbors import Neighbors, knn
-from vpd_lightning.renderer.fused_features import FEATURE_BACKENDS, fused_annular_features
-from vpd_lightning.renderer.point_features import annular_features
+from vpd_lightning.renderer.features.point_features import annular_features
+from vpd_lightning.renderer.kernels.fused_features import FEATURE_BACKENDS, fused_annular_features
 from vpd_lightning.types import Particles
 
 KERNELS = [0.0, 0.05, 0.1, 0.5], [0.05, 0.05, 0.05, 0.5]

@@ -29,7 +29,7 @@ def test_the_kernels_compile_for_a_gpu(element: str, num_kernels: int, width: in
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
-    from vpd_lightning.renderer import fused_features_triton, fused_loops_triton
+    from vpd_lightning.renderer.kernels import fused_features_triton, fused_loops_triton
 
     if not isinstance(fused_loops_triton.sum_features, triton.JITFunction):
         pytest.skip("the interpreter does not compile")

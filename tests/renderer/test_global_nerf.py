@@ -7,9 +7,9 @@ from tests.renderer.small_renderer import assert_same, loss_of, rays_of
 from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.geometry.ray_sampling import even_quantiles, sample_pdf
 from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.renderer.field.positional_encoding import positional_encoding
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 from vpd_lightning.renderer.global_nerf import GlobalNeRFRenderer
-from vpd_lightning.renderer.positional_encoding import positional_encoding
-from vpd_lightning.renderer.radiance_field import RadianceField
 from vpd_lightning.types import Particles, Rays, RenderedRays
 
 SMALL = {

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from vpd_lightning.graph.neighbors import Neighbors, knn
-from vpd_lightning.renderer.point_features import annular_features, check_kernels
+from vpd_lightning.renderer.features.point_features import annular_features, check_kernels
 from vpd_lightning.types import Particles
 
 RADII, BANDWIDTHS = (0.0, 0.05, 0.1, 0.5), (0.05, 0.05, 0.05, 0.5)

@@ -5,7 +5,7 @@ from tests.renderer.small_renderer import SMALL, assert_same, gradients_of, loss
 from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.graph.neighbors import knn
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.renderer.point_features import annular_features
+from vpd_lightning.renderer.features.point_features import annular_features
 from vpd_lightning.renderer.point_nerf import PointNeRFRenderer
 from vpd_lightning.types import Particles, Rays
 

@@ -5,7 +5,7 @@ import torch
 
 from tests.renderer.small_renderer import assert_same, gradients_of, rays_of, renderer_of, scene
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.renderer.particle_search import morton_sorted
+from vpd_lightning.renderer.rays.particle_search import morton_sorted
 from vpd_lightning.types import Particles
 
 OFF = {"features_backend": "torch", "sort_particles": False, "reuse_coarse": False, "checkpoint_chunks": False}

@@ -4,8 +4,8 @@ from functools import partial
 import pytest
 import torch
 
-from vpd_lightning.renderer.positional_encoding import encoding_dim, positional_encoding
-from vpd_lightning.renderer.radiance_field import RadianceField
+from vpd_lightning.renderer.field.positional_encoding import encoding_dim, positional_encoding
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 
 SMALL = {
     "input_dim": 6,

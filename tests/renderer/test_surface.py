@@ -6,8 +6,8 @@ import torch
 from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.graph.neighbors import knn
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.renderer.point_features import annular_features
-from vpd_lightning.renderer.ray_candidates import CandidateTable, RayCandidates, depth_hints, ray_features
+from vpd_lightning.renderer.features.point_features import annular_features
+from vpd_lightning.renderer.rays.ray_candidates import CandidateTable, RayCandidates, depth_hints, ray_features
 from vpd_lightning.renderer.surface import SurfaceRenderer
 from vpd_lightning.types import Particles, Rays, RenderedRays
 

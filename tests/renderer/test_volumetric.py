@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from vpd_lightning.renderer.volumetric import composite, ray_weights
+from vpd_lightning.renderer.rays.volumetric import composite, ray_weights
 
 
 def intervals(num_rays: int, num_samples: int) -> tuple[torch.Tensor, torch.Tensor]:

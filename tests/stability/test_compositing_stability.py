@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tests.stability.hard_scenes import Mode, is_finite
 from vpd_lightning.geometry.ray_sampling import even_quantiles, sample_pdf, stratified_samples
-from vpd_lightning.renderer.volumetric import composite
+from vpd_lightning.renderer.rays.volumetric import composite
 
 NUM_SAMPLES = 384  # the paper's ray
 DEPTHS = (0.0, 1e-45, 1e-30, 1e-12, 1e-7, 1e-3, 1.0, 30.0, 88.0, 110.0, 1e3, 1e6)

@@ -9,13 +9,13 @@ from torch import Tensor
 from tests.stability.backends import IS_INTERPRETED, require_route, routes
 from tests.stability.hard_scenes import MODES, SCENES, HardScene, Mode, is_finite, rotation
 from vpd_lightning.graph.neighbors import Neighbors, knn
-from vpd_lightning.renderer.point_features import annular_features, check_kernels
+from vpd_lightning.renderer.features.point_features import annular_features, check_kernels
 from vpd_lightning.types import Particles
 
 FEATURE_DIM = 5
 # Without the fused module there is the plain one alone.
-if find_spec("vpd_lightning.renderer.fused_features") is not None:
-    from vpd_lightning.renderer.fused_features import FEATURE_BACKENDS, fused_annular_features
+if find_spec("vpd_lightning.renderer.kernels.fused_features") is not None:
+    from vpd_lightning.renderer.kernels.fused_features import FEATURE_BACKENDS, fused_annular_features
 
     ROUTES = ("plain", "auto", *FEATURE_BACKENDS)
 else:

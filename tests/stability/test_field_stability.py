@@ -6,8 +6,8 @@ from torch import Tensor
 
 from tests.stability.hard_scenes import Mode, is_finite
 from tests.stability.known_faults import known_fault
-from vpd_lightning.renderer.positional_encoding import positional_encoding
-from vpd_lightning.renderer.radiance_field import DENSITY_ACTIVATIONS, RadianceField
+from vpd_lightning.renderer.field.positional_encoding import positional_encoding
+from vpd_lightning.renderer.field.radiance_field import DENSITY_ACTIVATIONS, RadianceField
 
 SIZES = (0.0, 1e-40, 1e-20, 1e-6, 1.0, 1e3, 1e6)
 

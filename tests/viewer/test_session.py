@@ -20,7 +20,7 @@ from vpd_lightning.editing.edit_files import load_edit, replay
 from vpd_lightning.editing.operations import Delete, Duplicate, Move
 from vpd_lightning.editing.selectors import Box, Everything
 from vpd_lightning.errors import EditError
-from vpd_lightning.export.camera_paths import read_camera_file
+from vpd_lightning.media.camera_paths import read_camera_file
 from vpd_lightning.viewer.exports import ExportFolder
 from vpd_lightning.viewer.opened_scene import OpenedScene
 from vpd_lightning.viewer.progressive_view import ProgressiveView, Request, Viewpoint

@@ -94,7 +94,7 @@ def _import(places: Sequence[str], settings: dict[str, Any]) -> int:
 def _inspect(places: Sequence[str], settings: dict[str, Any]) -> int:
     path = _one_place("inspect", places)
     _only("inspect", settings, ("out",))
-    from vpd_lightning.data.inspect import describe, inspect_dataset
+    from data_gen.inspection.inspect import describe, inspect_dataset
 
     print(describe(path))
     for drawn in inspect_dataset(path, Path(settings["out"]) if settings.get("out") else None):
@@ -105,7 +105,7 @@ def _inspect(places: Sequence[str], settings: dict[str, Any]) -> int:
 def _validate(places: Sequence[str], settings: dict[str, Any]) -> int:
     path = _one_place("validate", places)
     _only("validate", settings, ())
-    from vpd_lightning.data.validate import check_dataset
+    from data_gen.inspection.validate import check_dataset
 
     report = check_dataset(path)
     for fault in report.faults:
@@ -123,7 +123,7 @@ def _validate(places: Sequence[str], settings: dict[str, Any]) -> int:
 def _split(places: Sequence[str], settings: dict[str, Any]) -> int:
     path = _one_place("split", places)
     _only("split", settings, ("train", "validation", "test", "seed"))
-    from vpd_lightning.data.split import split_dataset
+    from data_gen.inspection.split import split_dataset
 
     result = split_dataset(path, **settings)
     for name, count in result.num_trajectories.items():

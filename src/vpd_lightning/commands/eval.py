@@ -17,7 +17,7 @@ def _run(words: list[str]) -> int:
 
     config = configure("eval", words)
     if config is not None:
-        from vpd_lightning.commands.evaluation_run import run_evaluation
+        from vpd_lightning.runs.evaluation_run import run_evaluation
 
         run_evaluation(config)
     return 0

@@ -27,10 +27,10 @@ def _run(words: list[str]) -> int:
 
 
 def _export(config: Mapping[str, Any]) -> None:
-    from vpd_lightning.export.output_folder import OutputFolder, choose_folder
-    from vpd_lightning.export.release import TrainedSystem, copy_release, find_metrics, write_release
-    from vpd_lightning.export.release_folder import folder_bytes, is_release
+    from vpd_lightning.files import OutputFolder, choose_folder
     from vpd_lightning.loading import load_model
+    from vpd_lightning.release.release import TrainedSystem, copy_release, find_metrics, write_release
+    from vpd_lightning.release.release_folder import folder_bytes, is_release
 
     source, folder = Path(config["ckpt"]).expanduser(), choose_folder(config["out"], Path())
     num_rays = config["renderer_program"]
@@ -51,7 +51,7 @@ def _export(config: Mapping[str, Any]) -> None:
 
 
 def _check(config: Mapping[str, Any], source: Path) -> None:
-    from vpd_lightning.export.release_folder import is_release
+    from vpd_lightning.release.release_folder import is_release
 
     num_rays = config["renderer_program"]
     if is_release(source) and num_rays is None:
@@ -66,8 +66,8 @@ def _check(config: Mapping[str, Any], source: Path) -> None:
 
 
 def _write_renderer(folder: Path, system: Any, num_rays: int) -> None:
-    from vpd_lightning.export.release_folder import PROGRAM_FILE
-    from vpd_lightning.export.renderer_program import export_renderer, write_program
+    from vpd_lightning.release.release_folder import PROGRAM_FILE
+    from vpd_lightning.release.renderer_program import export_renderer, write_program
     from vpd_lightning.simulator import Simulator
 
     num_particles = getattr(getattr(system, "encoder", None), "num_particles", None)

@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vpd_lightning.commands.environment import DISTRIBUTION, devices, git_commit, requirements, version_of
 from vpd_lightning.commands.report_errors import run_command
 from vpd_lightning.errors import ConfigError, RenderingBackendError
-from vpd_lightning.export.release_folder import list_releases
+from vpd_lightning.release.release_folder import list_releases
+from vpd_lightning.runs.environment import DISTRIBUTION, devices, git_commit, requirements, version_of
 
 HELP = """vpd-info - what this installation has, what it lacks, and the released models in ./released
 

@@ -26,18 +26,19 @@ def _run(words: list[str]) -> int:
 def _render(config: Mapping[str, Any]) -> None:
     import torch
 
-    from vpd_lightning.commands.one_recording import choose_trajectory, data_set, load_particle_simulator
-    from vpd_lightning.commands.progress import show_progress
-    from vpd_lightning.commands.threads import set_threads
     from vpd_lightning.data.manifest import file_sha256
     from vpd_lightning.editing.colored_editor import colored_editor
     from vpd_lightning.editing.edit_files import load_edit, replay
     from vpd_lightning.errors import OutOfMemoryError
-    from vpd_lightning.evaluation import filming
-    from vpd_lightning.evaluation.clip import encode_clip
-    from vpd_lightning.evaluation.viewpoints import choose_viewpoints, resize_viewpoints
-    from vpd_lightning.export.nerfstudio_paths import write_camera_path
-    from vpd_lightning.export.output_folder import OutputFolder, beside_checkpoint, choose_folder
+    from vpd_lightning.evaluation.prediction import encode_clip
+    from vpd_lightning.files import OutputFolder, choose_folder
+    from vpd_lightning.media import render_rollout as filming
+    from vpd_lightning.media.nerfstudio_paths import write_camera_path
+    from vpd_lightning.media.viewpoints import choose_viewpoints, resize_viewpoints
+    from vpd_lightning.release.results_folder import beside_checkpoint
+    from vpd_lightning.runs.one_recording import choose_trajectory, data_set, load_particle_simulator
+    from vpd_lightning.runs.progress import show_progress
+    from vpd_lightning.runs.threads import set_threads
 
     _check(config)
     set_threads(config["num_threads"])
@@ -103,8 +104,8 @@ def _render(config: Mapping[str, Any]) -> None:
 
 
 def _check(config: Mapping[str, Any]) -> None:
-    from vpd_lightning.evaluation.filmed_maps import MAPS
-    from vpd_lightning.evaluation.filming import PARTICLE_FORMATS
+    from vpd_lightning.media.filmed_maps import MAPS
+    from vpd_lightning.media.render_rollout import PARTICLE_FORMATS
 
     for name, lowest in (("num_steps", 1), ("start_frame", 0)):
         if config[name] < lowest:

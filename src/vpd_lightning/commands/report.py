@@ -49,9 +49,9 @@ def _run(words: list[str]) -> int:
     split = settings.get("split", "test")
     if split not in _SPLITS:
         raise ConfigError(f"split={split} does not exist.\nAllowed: {', '.join(_SPLITS)}.")
-    from vpd_lightning.export.output_folder import OutputFolder, choose_folder
-    from vpd_lightning.report.collect import collect
-    from vpd_lightning.report.writing import write_report
+    from vpd_lightning.comparison.collect import collect
+    from vpd_lightning.comparison.writing import write_report
+    from vpd_lightning.files import OutputFolder, choose_folder
 
     default = (
         folders[0] / "report" if len(folders) == 1 else Path("runs/report") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"

@@ -32,7 +32,7 @@ def _train(argv: list[str]) -> int:
     if arguments.is_question:
         answer("train", argv)
         return 0
-    from vpd_lightning.commands.sweeps import is_named_sweep
+    from vpd_lightning.runs.sweeps import is_named_sweep
 
     if not is_named_sweep(arguments.overrides):
         return _train_as_told(arguments)
@@ -43,7 +43,7 @@ def _train(argv: list[str]) -> int:
 
 def _train_sweep(arguments: Arguments) -> int:
     """All jobs of a named sweep, as far as they are not done."""
-    from vpd_lightning.commands.sweeps import run_sweep, sweep_jobs
+    from vpd_lightning.runs.sweeps import run_sweep, sweep_jobs
 
     jobs = sweep_jobs(arguments.overrides, arguments.config_dir)
     for job in jobs:
@@ -59,8 +59,8 @@ def _train_sweep(arguments: Arguments) -> int:
 
 def _train_as_told(arguments: Arguments) -> int:
     """One run, or with -m one for each combination of the values that are listed."""
-    from vpd_lightning.commands.resume import resumed_overrides, wants_auto
     from vpd_lightning.config import compose_with_folder, expand_sweep
+    from vpd_lightning.runs.resume import resumed_overrides, wants_auto
 
     overrides = resumed_overrides(arguments.overrides)
     jobs = expand_sweep("train", overrides, arguments.config_dir) if arguments.is_multirun else [overrides]
@@ -117,7 +117,7 @@ def _check_sections(config: dict[str, Any]) -> None:
 
 def _check_places(configs: Sequence[dict[str, Any]], overrides: Sequence[str], arguments: Arguments) -> None:
     """Refuse run folders that exist, and runs that would share one."""
-    from vpd_lightning.commands.resume import wants_auto
+    from vpd_lightning.runs.resume import wants_auto
 
     for config in configs:
         _check_folder(config, may_set_aside=wants_auto(arguments.overrides))
@@ -137,8 +137,8 @@ def _check_places(configs: Sequence[dict[str, Any]], overrides: Sequence[str], a
 
 def _check_folder(config: dict[str, Any], *, may_set_aside: bool) -> None:
     """Refuse a run folder that holds something, but for a start without a checkpoint that ``resume=auto`` may move."""
-    from vpd_lightning.commands.resume import has_checkpoint
-    from vpd_lightning.commands.run_claim import foreign_files, is_claimed
+    from vpd_lightning.runs.resume import has_checkpoint
+    from vpd_lightning.runs.run_claim import foreign_files, is_claimed
 
     folder = config["run"]["folder"]
     if not folder or config["resume"] or not _is_rank_zero():
@@ -172,7 +172,7 @@ def _check_folder(config: dict[str, Any], *, may_set_aside: bool) -> None:
 
 def _make_room(config: dict[str, Any]) -> None:
     """Move a start without a checkpoint out of the way of the next one; ``_check_folder`` has looked at it."""
-    from vpd_lightning.commands.run_claim import set_aside
+    from vpd_lightning.runs.run_claim import set_aside
 
     folder = config["run"]["folder"]
     if config["resume"] or not _is_rank_zero() or not _holds_something(Path(folder).expanduser()):
@@ -204,9 +204,9 @@ def _refuse_several_devices(trainer: dict[str, Any]) -> None:
 def _run_job(config: Any) -> None:
     from hydra.core.hydra_config import HydraConfig
 
-    from vpd_lightning.commands.training_run import close_log, train_in
     from vpd_lightning.config import plain
     from vpd_lightning.config.run_folders import ENVIRONMENT
+    from vpd_lightning.runs.training_run import close_log, train_in
 
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)

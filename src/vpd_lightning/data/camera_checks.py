@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vpd_lightning.data.broken_file import refuse
+from vpd_lightning.data.hdf5.broken_file import refuse
 
 _ORTHONORMAL_TOLERANCE = 1e-4  # importers store float32 poses; beyond this a rotation is not one
 _FOCAL_RANGE = (0.05, 200.0)  # focal length over image side: 170 degrees of view down to 0.3

@@ -12,14 +12,14 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from vpd_lightning.data.background import median_images
-from vpd_lightning.data.collate import NUM_CONTEXT_FRAMES, collate_clips
+from vpd_lightning.data.collate import collate_clips
 from vpd_lightning.data.dataset import ClipDataset, MovingRays
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.data.sampler import StepBatchSampler, StepLoader
 from vpd_lightning.data.validation import ValidationClips, VideoClip
 from vpd_lightning.errors import ConfigError, DataError
-from vpd_lightning.types import Cameras, VideoBatch
+from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras, VideoBatch
 
 
 class VideoDataModule(pl.LightningDataModule):

@@ -9,12 +9,12 @@ from jaxtyping import Float32, Int, UInt8
 from scipy.ndimage import maximum_filter
 from torch.utils.data import Dataset
 
-from vpd_lightning.data.collate import NUM_CONTEXT_FRAMES, ClipSample
+from vpd_lightning.data.collate import ClipSample
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.errors import DataError
 from vpd_lightning.geometry.cameras import rays_through
 from vpd_lightning.randomness import numpy_generator
-from vpd_lightning.types import Cameras
+from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras
 
 
 @dataclass(frozen=True)

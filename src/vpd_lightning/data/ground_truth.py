@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpd_lightning.data import schema
-from vpd_lightning.data.hdf5_checks import check_links, checked_dataset, open_file
-from vpd_lightning.data.stored_chunks import read_whole
+from vpd_lightning.data.hdf5.checks import check_links, checked_dataset, open_file
+from vpd_lightning.data.hdf5.stored_chunks import read_whole
 from vpd_lightning.errors import DataError
 
 

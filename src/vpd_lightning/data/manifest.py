@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from vpd_lightning.data.schema import SCHEMA_VERSION, AtomicPath
+from vpd_lightning.data.schema import SCHEMA_VERSION
 from vpd_lightning.errors import DataError
+from vpd_lightning.files import AtomicPath
 
 FILE_NAME = "dataset.json"
 UNFINISHED_NAME = ".unfinished.json"  # what a data set in the making was asked to be

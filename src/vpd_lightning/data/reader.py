@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpd_lightning.data import schema
-from vpd_lightning.data.broken_file import refuse
 from vpd_lightning.data.camera_checks import check_intrinsics, check_poses
-from vpd_lightning.data.hdf5_checks import checked_attribute, checked_dataset, named_damage, open_file
-from vpd_lightning.data.image_chunks import ImageChunks
-from vpd_lightning.data.stored_chunks import read_whole
+from vpd_lightning.data.hdf5.broken_file import refuse
+from vpd_lightning.data.hdf5.checks import checked_attribute, checked_dataset, named_damage, open_file
+from vpd_lightning.data.hdf5.image_chunks import ImageChunks
+from vpd_lightning.data.hdf5.stored_chunks import read_whole
 
 MAX_IMAGE_SIDE = 16384
 MAX_FRAMES = 1_000_000

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vpd_lightning.editing.scene_editor import SceneEditor
-from vpd_lightning.export.particle_colors import particle_colors
+from vpd_lightning.media.particle_colors import particle_colors
 from vpd_lightning.simulator import Scene, Simulator
 from vpd_lightning.types import Particles
 

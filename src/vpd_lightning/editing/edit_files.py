@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vpd_lightning.data.ply import write_ply
-from vpd_lightning.data.schema import AtomicPath
 from vpd_lightning.editing.operations import Insert, InsertPoints, Operation
 from vpd_lightning.editing.plain_edits import operation_from, plain_operation
 from vpd_lightning.editing.scene_editor import SceneEditor
 from vpd_lightning.errors import EditError, one_line
+from vpd_lightning.files import AtomicPath
+from vpd_lightning.media.ply import write_ply
 from vpd_lightning.simulator import Scene
 from vpd_lightning.types import Particles
 

@@ -141,7 +141,7 @@ class Color(Selector):
         if state.colors is None:
             raise EditError(
                 "This scene's particles have no colours.\n"
-                "Give SceneEditor colors=..., for example those of vpd_lightning.export.particle_colors."
+                "Give SceneEditor colors=..., for example those of vpd_lightning.media.particle_colors."
             )
         difference = state.colors - torch.tensor(self.rgb).to(state.colors)
         return difference.square().sum(dim=-1) <= self.tolerance**2

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vpd_lightning.encoder.base import AbstractBackground, EncoderOutput
-from vpd_lightning.encoder.unet_network import UNetNetwork
-from vpd_lightning.encoder.unprojection import UnprojectingEncoder
+from vpd_lightning.encoder.networks.unet_network import UNetNetwork
+from vpd_lightning.encoder.particles.unprojection import UnprojectingEncoder
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import RGBDFrames
 

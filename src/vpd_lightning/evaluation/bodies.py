@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vpd_lightning.evaluation.protocol import Clip
+from vpd_lightning.data.clip import Clip
 from vpd_lightning.metrics.rigid_motion import inside_box, move_with_body
 from vpd_lightning.metrics.surface_distance import SurfacePoints, nearest_on_surface, surface_of
 

@@ -9,9 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.errors import DataError
-from vpd_lightning.evaluation.clip import (
+from vpd_lightning.evaluation.long_rollout import LongRollout, judge_long_rollout
+from vpd_lightning.evaluation.measuring import SYSTEMS, ClipResult, measure_clip
+from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
+from vpd_lightning.evaluation.prediction import (
     Prediction,
     PredictsVideo,
     PredictsViews,
@@ -22,10 +26,7 @@ from vpd_lightning.evaluation.clip import (
     views_seen,
     without_depth,
 )
-from vpd_lightning.evaluation.long_rollout import LongRollout, judge_long_rollout
-from vpd_lightning.evaluation.measuring import SYSTEMS, ClipResult, measure_clip
-from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
-from vpd_lightning.evaluation.protocol import Clip, Protocol, read_clip, read_clips
+from vpd_lightning.evaluation.protocol import Protocol, read_clips
 from vpd_lightning.evaluation.references import median_displacements, training_mean
 
 Progress = Callable[[str, int, int], None]

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vpd_lightning.evaluation.clip import Prediction
+from vpd_lightning.data.clip import Clip
 from vpd_lightning.evaluation.evaluate import Evaluation
-from vpd_lightning.evaluation.protocol import Clip
+from vpd_lightning.evaluation.prediction import Prediction
 from vpd_lightning.evaluation.report import step_table
-from vpd_lightning.export.pictures import write_contact_sheet, write_curves
-from vpd_lightning.export.video import comparison_frames, write_video
+from vpd_lightning.media.pictures import write_contact_sheet, write_curves
+from vpd_lightning.media.video import comparison_frames, write_video
 
 _MAX_COLUMNS = 6
 _MAX_SHEET_CLIPS = 3

@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vpd_lightning.evaluation.protocol import Clip, Protocol
+from vpd_lightning.data.clip import Clip
+from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.metrics.moving import moving_by_difference, moving_by_segmentation
 from vpd_lightning.metrics.psnr import PSNR_CAP, mean_squared_error, psnr_of
 from vpd_lightning.metrics.sharpness import sharpness

@@ -8,12 +8,13 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vpd_lightning.data.clip import Clip
 from vpd_lightning.evaluation.bodies import find_bodies
-from vpd_lightning.evaluation.clip import Prediction
 from vpd_lightning.evaluation.images import TrueImages, as_float, image_metrics, moving_pixels
 from vpd_lightning.evaluation.motion import MIN_BODY_PARTICLES, bodies_motion, chamfer_to_depth
 from vpd_lightning.evaluation.penetration import clip_penetration
-from vpd_lightning.evaluation.protocol import Clip, Protocol
+from vpd_lightning.evaluation.prediction import Prediction
+from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.geometry.resizing import resize_images
 
 SYSTEMS = ("model", "copy_last", "train_mean")

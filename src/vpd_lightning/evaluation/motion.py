@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vpd_lightning.data.clip import Clip
 from vpd_lightning.evaluation.bodies import Body, find_bodies, surface_errors
-from vpd_lightning.evaluation.protocol import Clip
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.geometry.workspace import inside_workspace
 from vpd_lightning.metrics.body_dynamics import centroid_velocity, orientation_error, specific_energy

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vpd_lightning.data.clip import Clip
 from vpd_lightning.evaluation.bodies import Body
-from vpd_lightning.evaluation.protocol import Clip
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.geometry.workspace import inside_workspace
 from vpd_lightning.metrics.penetration import below_floor, deepest, inside_box_depth

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from vpd_lightning.data.clip import NUM_CONTEXT
 from vpd_lightning.data.ground_truth import read_positions
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.errors import DataError
-from vpd_lightning.evaluation.protocol import NUM_CONTEXT
 
 _NUM_ITERATIONS = 100
 _SOFTENING = 1e-4  # m

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vpd_lightning.data.schema import AtomicPath
 from vpd_lightning.evaluation.evaluate import Evaluation
 from vpd_lightning.evaluation.events import events_of
 from vpd_lightning.evaluation.long_rollout import LongRollout
 from vpd_lightning.evaluation.measuring import SYSTEMS
 from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.evaluation.statistics import plain, pooled_psnr, summarize
+from vpd_lightning.files import AtomicPath
 
 FORMAT_VERSION = 1
 IMAGE_METRICS = ("psnr", "psnr_moving", "ssim", "sharpness")

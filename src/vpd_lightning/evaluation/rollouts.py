@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vpd_lightning.data.schema import AtomicPath
 from vpd_lightning.evaluation.evaluate import Evaluation
+from vpd_lightning.files import AtomicPath
 
 MAX_CLIPS = 2
 

@@ -5,9 +5,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from vpd_lightning.data.schema import AtomicPath
 from vpd_lightning.evaluation.report import step_table
 from vpd_lightning.evaluation.summary import horizons, summary_lines
+from vpd_lightning.files import AtomicPath
 
 _STYLE = """
 :root { color-scheme: light dark; }

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from vpd_lightning.renderer.radiance_field import RadianceField
+from vpd_lightning.renderer.field.radiance_field import RadianceField
 
 
 @dataclass(frozen=True)

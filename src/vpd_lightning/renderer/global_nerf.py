@@ -10,11 +10,11 @@ from torch import Tensor
 from vpd_lightning.graph.pooling import mean_features
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
-from vpd_lightning.renderer.chunked_rays import automatic_chunk_size, joined, ray_slices, recomputed, uniform_draws
-from vpd_lightning.renderer.positional_encoding import encoding_dim, positional_encoding
-from vpd_lightning.renderer.precision import at_least_float32, full_precision
-from vpd_lightning.renderer.radiance_field import RadianceField
-from vpd_lightning.renderer.two_tiers import (
+from vpd_lightning.renderer.field.positional_encoding import encoding_dim, positional_encoding
+from vpd_lightning.renderer.field.precision import at_least_float32, full_precision
+from vpd_lightning.renderer.field.radiance_field import RadianceField
+from vpd_lightning.renderer.rays.chunked_rays import automatic_chunk_size, joined, ray_slices, recomputed, uniform_draws
+from vpd_lightning.renderer.rays.hierarchical_sampling import (
     closed_color,
     coarse_samples,
     composited_rays,
@@ -22,7 +22,7 @@ from vpd_lightning.renderer.two_tiers import (
     interval_ends,
     points_along,
 )
-from vpd_lightning.renderer.volumetric import ray_weights
+from vpd_lightning.renderer.rays.volumetric import ray_weights
 from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
 

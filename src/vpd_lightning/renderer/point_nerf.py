@@ -10,15 +10,15 @@ from torch import Tensor
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
-from vpd_lightning.renderer.chunked_rays import automatic_chunk_size, joined, ray_slices, recomputed, uniform_draws
-from vpd_lightning.renderer.feature_network import FeatureNetwork
-from vpd_lightning.renderer.fused_features import FEATURE_BACKENDS
-from vpd_lightning.renderer.neighbor_features import NeighborFeatures
-from vpd_lightning.renderer.point_features import check_kernels
-from vpd_lightning.renderer.precision import at_least_float32
-from vpd_lightning.renderer.radiance_field import RadianceField
-from vpd_lightning.renderer.sample_features import SampleFeatures
-from vpd_lightning.renderer.two_tiers import (
+from vpd_lightning.renderer.features.feature_network import FeatureNetwork
+from vpd_lightning.renderer.features.neighbor_features import NeighborFeatures
+from vpd_lightning.renderer.features.point_features import check_kernels
+from vpd_lightning.renderer.features.sample_features import SampleFeatures
+from vpd_lightning.renderer.field.precision import at_least_float32
+from vpd_lightning.renderer.field.radiance_field import RadianceField
+from vpd_lightning.renderer.kernels.fused_features import FEATURE_BACKENDS
+from vpd_lightning.renderer.rays.chunked_rays import automatic_chunk_size, joined, ray_slices, recomputed, uniform_draws
+from vpd_lightning.renderer.rays.hierarchical_sampling import (
     closed_color,
     coarse_samples,
     composited_rays,
@@ -26,7 +26,7 @@ from vpd_lightning.renderer.two_tiers import (
     interval_ends,
     points_along,
 )
-from vpd_lightning.renderer.volumetric import ray_weights
+from vpd_lightning.renderer.rays.volumetric import ray_weights
 from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
 

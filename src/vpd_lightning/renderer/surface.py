@@ -9,23 +9,23 @@ from torch import Tensor, nn
 
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
-from vpd_lightning.renderer.chunked_rays import joined, ray_slices, recomputed, uniform_draws
-from vpd_lightning.renderer.feature_network import FeatureNetwork
-from vpd_lightning.renderer.neighbor_features import NeighborFeatures
-from vpd_lightning.renderer.point_features import check_kernels
-from vpd_lightning.renderer.positional_encoding import encoding_dim, positional_encoding
-from vpd_lightning.renderer.precision import at_least_float32, full_precision
-from vpd_lightning.renderer.radiance_field import RadianceField
-from vpd_lightning.renderer.ray_candidates import (
+from vpd_lightning.renderer.features.feature_network import FeatureNetwork
+from vpd_lightning.renderer.features.neighbor_features import NeighborFeatures
+from vpd_lightning.renderer.features.point_features import check_kernels
+from vpd_lightning.renderer.features.sample_features import SampleFeatures
+from vpd_lightning.renderer.field.positional_encoding import encoding_dim, positional_encoding
+from vpd_lightning.renderer.field.precision import at_least_float32, full_precision
+from vpd_lightning.renderer.field.radiance_field import RadianceField
+from vpd_lightning.renderer.kernels.ray_search import Candidates, check_backend
+from vpd_lightning.renderer.rays.chunked_rays import joined, ray_slices, recomputed, uniform_draws
+from vpd_lightning.renderer.rays.ray_candidates import (
     CandidateTable,
     RayCandidates,
     depth_hints,
     ray_features,
     ray_neighbor_features,
 )
-from vpd_lightning.renderer.ray_search import Candidates, check_backend
-from vpd_lightning.renderer.sample_features import SampleFeatures
-from vpd_lightning.renderer.volumetric import composite
+from vpd_lightning.renderer.rays.volumetric import composite
 from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from vpd_lightning.errors import EditError
-from vpd_lightning.export.video import enlarge
+from vpd_lightning.media.video import enlarge
 from vpd_lightning.types import Cameras
 from vpd_lightning.viewer.exports import PARTICLE_FORMATS
 from vpd_lightning.viewer.progressive_view import Viewpoint

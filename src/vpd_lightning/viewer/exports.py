@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from vpd_lightning.data.ply import write_ply
 from vpd_lightning.editing.edit_files import save_edit
 from vpd_lightning.editing.operations import Operation
 from vpd_lightning.errors import EditError
-from vpd_lightning.export.nerfstudio_paths import write_camera_path
-from vpd_lightning.export.particle_files import write_glb, write_particles
-from vpd_lightning.export.video import write_video
+from vpd_lightning.media.nerfstudio_paths import write_camera_path
+from vpd_lightning.media.particle_files import write_glb, write_particles
+from vpd_lightning.media.ply import write_ply
+from vpd_lightning.media.video import write_video
 from vpd_lightning.types import Cameras, Particles
 
 PARTICLE_FORMATS = ("ply", "glb", "npz")

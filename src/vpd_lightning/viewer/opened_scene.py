@@ -11,12 +11,12 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vpd_lightning.data.clip import read_clip
 from vpd_lightning.data.reader import TrajectoryReader
-from vpd_lightning.evaluation.clip import encode_clip
-from vpd_lightning.evaluation.protocol import read_clip
-from vpd_lightning.export.camera_paths import common_target
-from vpd_lightning.export.particle_colors import particle_colors
+from vpd_lightning.evaluation.prediction import encode_clip
 from vpd_lightning.geometry.cameras import unproject
+from vpd_lightning.media.camera_paths import common_target
+from vpd_lightning.media.particle_colors import particle_colors
 from vpd_lightning.simulator import Scene, Simulator
 from vpd_lightning.types import Cameras, Particles
 

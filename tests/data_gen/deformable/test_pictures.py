@@ -11,13 +11,13 @@ from data_gen.deformable import Settings
 from data_gen.deformable.settings import DeformableSettings
 from data_gen.deformable.tetrahedra import boundary_faces
 from data_gen.generate import generate
+from data_gen.inspection.validate import validate_dataset
 from data_gen.settings import load_settings
 from tests.data_gen.deformable.surface_distance import distance_to_triangles, free_space_violations, unproject
 from vpd_lightning.data import schema
 from vpd_lightning.data.ground_truth import has_state, read_state
-from vpd_lightning.data.hdf5_checks import open_file
+from vpd_lightning.data.hdf5.checks import open_file
 from vpd_lightning.data.reader import TrajectoryReader
-from vpd_lightning.data.validate import validate_dataset
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from data_gen.inspection.validate import validate_dataset
 from tests.data_gen.importers import known_scene
 from vpd_lightning.data.reader import TrajectoryReader
-from vpd_lightning.data.validate import validate_dataset
 
 TOLERANCE = 1e-4  # m: half a step of the samples' 16-bit depth is 0.05 mm; float32 adds less than 0.001 mm
 

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from data_gen.importers.recording import Recording
 from data_gen.importers.run import import_recordings
+from data_gen.inspection.validate import Report, check_dataset
 from tests.data_gen.importers.known_scene import Array, camera, distance_to_surfaces, unproject
-from vpd_lightning.data.validate import Report, check_dataset
 
 HEIGHT, WIDTH = 48, 64
 FOCAL = 70.0

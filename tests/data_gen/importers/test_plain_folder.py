@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from data_gen.importers.run import import_recordings
+from data_gen.inspection.validate import validate_dataset
 from tests.data_gen.importers import known_scene
 from tests.data_gen.importers.checks import TOLERANCE, assert_valid, attributes, camera_errors, files, worst_point
 from tests.data_gen.importers.plain_recording import HEIGHT, WIDTH, change, write_plain
 from vpd_lightning.data.reader import TrajectoryReader
-from vpd_lightning.data.validate import validate_dataset
 from vpd_lightning.errors import DataError
 
 LENS = np.array([-0.18, 0.04, 0.002, -0.001, 0.0])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from data_gen.generate import generate
+from data_gen.inspection.validate import validate_dataset
 from tests.data_gen.test_gl import read
-from vpd_lightning.data.validate import validate_dataset
 
 ONE = {"splits.train": 1, "splits.validation": 0, "splits.test": 0}
 

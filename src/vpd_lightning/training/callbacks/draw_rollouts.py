@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vpd_lightning.data.validation import VideoClip
-from vpd_lightning.export.pictures import write_png
-from vpd_lightning.export.video import comparison_frames, write_video
+from vpd_lightning.media.pictures import write_png
+from vpd_lightning.media.video import comparison_frames, write_video
 
 FOLDER = "validation"
 

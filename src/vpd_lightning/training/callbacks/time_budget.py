@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import lightning.pytorch as pl
 
-from vpd_lightning.data.schema import AtomicPath
 from vpd_lightning.errors import ConfigError
+from vpd_lightning.files import AtomicPath
 from vpd_lightning.training.module import VPDModule
 
 FILE = "training_time.json"

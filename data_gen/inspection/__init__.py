@@ -1,0 +1,1 @@
+"""Judge and look at data sets: validate, inspect, split."""

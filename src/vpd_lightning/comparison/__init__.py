@@ -1,0 +1,1 @@
+"""Compares many evaluated runs: tables, curves, grids and videos (``vpd-report``)."""

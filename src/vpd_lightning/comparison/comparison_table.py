@@ -1,0 +1,211 @@
+"""Runs brought together: one board per data set and protocol, one row per system and setting, seeds in the row."""
+
+import hashlib
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from vpd_lightning.comparison.bootstrap import Estimate, Sums, estimate, stacked
+from vpd_lightning.comparison.measure import BY_NAME
+from vpd_lightning.comparison.run import Run
+from vpd_lightning.comparison.settings import (
+    TRAJECTORIES,
+    comparable,
+    comparable_settings,
+    differing,
+    label,
+    naming_keys,
+)
+
+# The order of the paper's table; others follow by name.
+SYSTEMS = ("slotformer", "savi", "global", "sequential", "vpd", "inertial", "persistence")
+EXPERIMENTS = (
+    "mujoco_block", "deformable_block", "deformable_multi", "deformable_collision", "movi_a", "movi_b", "movi_c",
+    "movi_a_high", "movi_c_high",
+)  # fmt: skip
+
+Groups = dict[tuple[object, ...], list[Run]]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """All seeds of one system in one setting; ``name`` tells it from the other rows of its board.
+
+    ``settings`` are those that differ among the rows of its system, ``is_main`` marks the one that stands for it.
+    """
+
+    system: str
+    name: str
+    settings: Mapping[str, Hashable]
+    runs: tuple[Run, ...]
+    is_main: bool
+
+    def sums(self, measure: str, source: str = "model") -> Sums | None:
+        """The sums of all seeds; None unless each of them has them."""
+        parts = [run.sums.get((source, measure)) for run in self.runs]
+        known = [part for part in parts if part is not None]
+        if len(known) < len(parts) or len({part[0].shape for part in known}) != 1:
+            return None
+        return stacked(known)
+
+    def estimate(self, measure: str) -> Estimate | None:
+        """Mean over the seeds of the printed means, with the interval that the arrays give."""
+        return self._estimates[measure]
+
+    @cached_property
+    def _estimates(self) -> dict[str, Estimate | None]:
+        return {measure: self._estimate(measure) for measure in BY_NAME}
+
+    def _estimate(self, measure: str) -> Estimate | None:
+        summaries = [BY_NAME[measure].summary(run.metrics) for run in self.runs]
+        means = [summary["mean"] for summary in summaries if summary is not None]
+        if len(means) < len(self.runs):
+            return None
+        sums = self.sums(measure)
+        found = estimate(sums, self.runs[0].num_bootstrap) if sums is not None else None
+        printed = summaries[0]["ci95"] if len(means) == 1 and summaries[0] else None
+        interval = found.interval if found else tuple(printed) if printed else None
+        return Estimate(sum(means) / len(means), interval)
+
+    def per_step(self, measure: str) -> list[float | None]:
+        """Mean over the seeds of each step's printed mean; empty where there is none."""
+        summaries = [BY_NAME[measure].summary(run.metrics) for run in self.runs]
+        curves = [summary.get("per_step") or [] for summary in summaries if summary is not None]
+        if len(curves) < len(self.runs) or len({len(curve) for curve in curves}) != 1:
+            return []
+        return [None if None in values else sum(values) / len(values) for values in zip(*curves, strict=True)]
+
+
+@dataclass(frozen=True)
+class Board:
+    """The rows that may be compared: same experiment, same bytes of data, same protocol."""
+
+    experiment: str
+    title: str
+    data_sha256: str
+    rows: tuple[Row, ...]
+
+    @cached_property
+    def main_rows(self) -> tuple[Row, ...]:
+        """One row per system."""
+        return tuple(row for row in self.rows if row.is_main)
+
+    @property
+    def runs(self) -> list[Run]:
+        """All runs of the board."""
+        return [run for row in self.rows for run in row.runs]
+
+    @property
+    def file_name(self) -> str:
+        """The title as files are named."""
+        return "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in self.title)
+
+    def reference(self, source: str, measure: str) -> Estimate | None:
+        """The score of ``copy_last`` or ``train_mean``, which is that of the first run that has it."""
+        found = (BY_NAME[measure].summary(run.metrics, source) for run in self.runs)
+        summary = next((one for one in found if one is not None), None)
+        if summary is None:
+            return None
+        interval = summary.get("ci95")
+        return Estimate(summary["mean"], tuple(interval) if interval else None)
+
+    def reference_sums(self, source: str, measure: str) -> Sums | None:
+        """The sums of a reference, as those of one seed."""
+        found = (run.sums.get((source, measure)) for run in self.runs)
+        part = next((one for one in found if one is not None), None)
+        return None if part is None else stacked([part])
+
+
+def boards_of(runs: Sequence[Run]) -> list[Board]:
+    """Bring runs together. Runs on other data or under another protocol get a board of their own."""
+    groups: dict[tuple[str, str, str], list[Run]] = {}
+    for run in sorted(runs, key=lambda run: (_rank(EXPERIMENTS, run.experiment), run.data_sha256, run.protocol)):
+        groups.setdefault((run.experiment, run.data_sha256, run.protocol), []).append(run)
+    compared: dict[object, set[tuple[str, str]]] = {}
+    for run in runs:
+        compared.setdefault(run.config.get("sweep_name"), set()).add((run.experiment, run.system))
+    reach = {sweep: len(places) for sweep, places in compared.items()}
+    boards = []
+    for (experiment, data_sha256, protocol), group in groups.items():
+        same_name = [key for key in groups if key[0] == experiment]
+        other_data, other_protocol = (len({key[i] for key in same_name}) > 1 for i in (1, 2))
+        title = experiment
+        title += f"-data-{data_sha256[:6]}" if other_data else ""
+        title += f"-protocol-{hashlib.sha256(protocol.encode()).hexdigest()[:6]}" if other_protocol else ""
+        boards.append(Board(experiment, title, data_sha256, tuple(_rows(group, reach))))
+    return boards
+
+
+def _rows(runs: Sequence[Run], reach: Mapping[object, int]) -> list[Row]:
+    rows = []
+    shared: dict[str, set[str]] = {}
+    for run in runs:
+        shared.setdefault(run.declared_budget, set()).add(run.system)
+    budgets = {budget: len(systems) for budget, systems in shared.items()}
+    for system in sorted({run.system for run in runs}, key=system_order):
+        settings = {id(run): comparable_settings(run) for run in runs if run.system == system}
+        keys = differing(list(settings.values()))
+        names = naming_keys(list(settings.values()))
+        groups: Groups = {}
+        for run in runs:
+            if run.system == system:
+                groups.setdefault(tuple(comparable(settings[id(run)], key) for key in keys), []).append(run)
+        placed = sorted(groups.items(), key=lambda item: _place(settings[id(item[1][0])], names))
+        main = max(placed, key=lambda item: _weight(item, groups, reach, budgets))[0]
+        for group, members in placed:
+            own = settings[id(members[0])]
+            words = label(own, names)
+            name = f"{system} ({words})" if words else system
+            ordered = tuple(sorted(members, key=lambda run: run.seed))
+            rows.append(Row(system, name, {key: own[key] for key in keys if key in own}, ordered, group == main))
+    return rows
+
+
+def _place(settings: Mapping[str, Hashable], names: Sequence[str]) -> list[tuple[int, float, str]]:
+    """Sort numbers by size, lists by length, and null (all there is) last."""
+    places = []
+    for name in names:
+        value = settings.get(name)
+        if isinstance(value, int | float):
+            places.append((0, float(value), ""))
+        else:
+            places.append((2, 0.0, "") if value is None else (1, float(len(str(value))), str(value)))
+    return places
+
+
+def _weight(
+    item: tuple[tuple[object, ...], list[Run]],
+    groups: Groups,
+    reach: Mapping[object, int],
+    budgets: Mapping[str, int],
+) -> tuple:
+    """What makes a setting stand for its system; the first that tells two apart counts.
+
+    It was evaluated as it was trained; it had the budget that most systems share, which ``budgets`` counts; it is of
+    the sweep (None: of no sweep) that goes over most systems and data
+    sets, which ``reach`` counts; it has most seeds; it is of no sweep; it differs least from the others, as what
+    several sweeps start from does; it has most data.
+    """
+    values, runs = item
+    sweeps = {run.config.get("sweep_name") for run in runs}
+    count = comparable_settings(runs[0]).get(TRAJECTORIES)
+    return (
+        not runs[0].asked_to_differ,
+        max(budgets[run.declared_budget] for run in runs),
+        max(reach[sweep] for sweep in sweeps),
+        len(runs),
+        None in sweeps,
+        -sum(own != other for group in groups for own, other in zip(values, group, strict=True)),
+        float(count) if isinstance(count, int | float) else float("inf"),
+    )
+
+
+def system_order(name: str) -> tuple[int, str]:
+    """The place of a system in tables, as a key to sort by."""
+    return _rank(SYSTEMS, name)
+
+
+def _rank(order: Sequence[str], name: str) -> tuple[int, str]:
+    """A variant stands behind what it varies: vpd_two_steps behind vpd."""
+    known = [known for known in order if name == known or name.startswith(f"{known}_")]
+    return (order.index(max(known, key=len)) if known else len(order)), name

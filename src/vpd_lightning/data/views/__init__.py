@@ -1,0 +1,1 @@
+"""Single-view clips and stored slots, for SAVi and SlotFormer."""

@@ -1,0 +1,166 @@
+"""The learned part of the inertial dynamics: forces on bodies from contact, weight and one another."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia
+from vpd_lightning.dynamics.inertial.contact import Contacts
+from vpd_lightning.dynamics.inertial.rigid_motion import cross, rotate
+
+
+class BodyForces(nn.Module):
+    """A graph network of probes (particles) and bodies whose output acts as force and torque do.
+
+    Probes send their state and contact to the bodies; bodies exchange messages; each body then places
+    ``num_forces`` forces by attention over its probes. A force changes the body's displacement by itself, and its
+    spin by the torque about the body's centre through the inverse inertia, so that a contact at a few particles
+    moves and turns the whole body (Newton-Euler). One more force acts at the centre, without torque, as weight does,
+    and one acceleration is the same for all bodies, always: what it is, and where it points, is learned. Forces are at
+    most ``residual_share`` of ``force_scale`` (metres per step squared), which bounds the acceleration: while it is not
+    known, they must not try to stand in for it.
+    Damping scales what was carried: impacts and friction remove motion
+    in proportion to it. Zero-initialised: no force, hardly any damping (0.7 % a step).
+    """
+
+    def __init__(
+        self,
+        *,
+        hidden_dim: int,
+        message_passing_steps: int,
+        num_forces: int,
+        location_scale: float,
+        force_scale: float,
+        residual_share: float,
+        contact_range: float,
+    ):
+        super().__init__()
+        self.num_forces, self.contact_range = num_forces, contact_range
+        self.location_scale, self.force_scale = location_scale, force_scale
+        self.residual_scale = residual_share * force_scale
+        self.acceleration = nn.Parameter(torch.zeros(3))
+        self.encode_probe = _mlp(19, hidden_dim, hidden_dim)
+        self.encode_body = _mlp(2 * hidden_dim + 7, hidden_dim, hidden_dim)
+        self.messages = nn.ModuleList(
+            _mlp(2 * hidden_dim + 4, hidden_dim, hidden_dim) for _ in range(message_passing_steps)
+        )
+        self.updates = nn.ModuleList(_mlp(2 * hidden_dim, hidden_dim, hidden_dim) for _ in range(message_passing_steps))
+        self.probe_query = nn.Linear(hidden_dim, hidden_dim)
+        self.body_query = nn.Linear(hidden_dim, hidden_dim, bias=False)
+        self.attention = nn.Linear(hidden_dim, num_forces)
+        self.force = nn.Linear(hidden_dim, 3 * num_forces)
+        self.offset_query = nn.Linear(3, hidden_dim, bias=False)
+        self.damping = nn.Linear(hidden_dim, 2)
+        self.weight = nn.Linear(hidden_dim, 3)
+        for layer in (self.force, self.damping, self.weight):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def forward(
+        self,
+        positions: Float[Tensor, "batch probe 3"],
+        displacements: Float[Tensor, "batch probe 3"],
+        contacts: Contacts,
+        mask: Bool[Tensor, "batch probe"],
+        weights: Float[Tensor, "batch body probe"],
+        motion: BodyMotion,
+        inertia: Inertia,
+    ) -> BodyMotion:
+        """Return the corrected motion. Lengths are metres per step; weights are 1 where a probe belongs to a body."""
+        probe = self.encode_probe(self._probe_inputs(displacements, contacts)) * mask[..., None]
+        share = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-12)
+        mean = torch.einsum("bap,bph->bah", share, probe)
+        own = mask[:, None] & (weights > 0)
+        peak = probe[:, None].masked_fill(~own[..., None], -torch.inf).amax(dim=2)
+        peak = torch.where(own.any(dim=2)[..., None], peak, 0.0)
+        clearance = self._clearance(contacts, mask, share)
+        body = torch.cat([mean, peak, motion.displacements / self.location_scale, motion.spins, clearance], dim=-1)
+        body = self.encode_body(body)
+        relative = (motion.centers[:, :, None] - motion.centers[:, None]) / self.contact_range
+        distance = relative.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+        count = body.shape[1]
+        there = (weights.sum(dim=-1) > 0).to(body.dtype)
+        heard = self._heard(distance, there)
+        for message, update in zip(self.messages, self.updates, strict=True):
+            pair = [body[:, :, None].expand(-1, -1, count, -1), body[:, None].expand(-1, count, -1, -1)]
+            received = (message(torch.cat([*pair, relative, distance], dim=-1)) * heard).sum(dim=2)
+            body = body + update(torch.cat([body, received], dim=-1))
+        return self._push(positions, share, probe, body, there, motion, inertia)
+
+    def _heard(
+        self, distances: Float[Tensor, "batch body body 1"], there: Float[Tensor, "batch body"]
+    ) -> Float[Tensor, "batch body body 1"]:
+        """Return what each body hears of each, itself most: less with distance, nothing beyond the contact range.
+
+        So a body that is alone moves as one whose neighbours are far away, which training shows.
+        """
+        nearness = (1 - distances.square()).clamp(min=0).square() * there[:, None, :, None]
+        return nearness / nearness.sum(dim=2, keepdim=True).clamp(min=1)
+
+    def _probe_inputs(self, displacements: Tensor, contacts: Contacts) -> Tensor:
+        normal_speed = (displacements * contacts.normals).sum(dim=-1, keepdim=True)
+        tangential = displacements - normal_speed * contacts.normals
+        gap = contacts.distances[..., None].clamp(-self.contact_range, self.contact_range)
+        ahead = (gap + normal_speed).clamp(-self.contact_range, self.contact_range)
+        widths = (0.05 * self.contact_range, 0.15 * self.contact_range)
+        near = [torch.exp(-(value / width).square()) for value in (gap, ahead) for width in widths]
+        lateral = (contacts.lateral[..., None] / self.contact_range).clamp(max=1)
+        return torch.cat(
+            [
+                displacements / self.location_scale,
+                tangential / self.location_scale,
+                normal_speed / self.location_scale,
+                gap / self.contact_range,
+                ahead / self.location_scale,
+                nn.functional.relu(-ahead) / self.location_scale,
+                lateral,
+                *near,
+                contacts.normals,
+                (contacts.normals.square().sum(dim=-1, keepdim=True) > 0.5).to(gap.dtype),
+            ],
+            dim=-1,
+        )
+
+    def _clearance(self, contacts: Contacts, mask: Tensor, share: Tensor) -> Tensor:
+        """Lowest distance of the body's probes to what stands still: is anything touching at all?"""
+        belongs = mask[:, None] & (share > 1e-3 * share.amax(dim=-1, keepdim=True))
+        distances = contacts.distances[:, None].expand_as(share)
+        lowest = distances.masked_fill(~belongs, self.contact_range).amin(dim=-1, keepdim=True)
+        return lowest.clamp(-self.contact_range, self.contact_range) / self.contact_range
+
+    def _push(
+        self,
+        positions: Tensor,
+        share: Tensor,
+        probe: Tensor,
+        body: Tensor,
+        there: Tensor,
+        motion: BodyMotion,
+        inertia: Inertia,
+    ) -> BodyMotion:
+        offsets = positions[:, None] - motion.centers[:, :, None]
+        pair = self.probe_query(probe)[:, None] + self.body_query(body)[:, :, None]
+        pair = torch.relu(pair + self.offset_query(offsets / self.contact_range))
+        logits = self.attention(pair) + torch.log(share.clamp(min=1e-12))[..., None]
+        attention = torch.softmax(logits, dim=2)  # batch body probe force
+        forces = self.residual_scale * torch.tanh(self.force(pair)).unflatten(-1, (self.num_forces, 3))
+        forces = attention[..., None] * forces
+        push = forces.sum(dim=(2, 3))
+        torque = cross(offsets, forces.sum(dim=3)).sum(dim=2)
+        weight = self.residual_scale * torch.tanh(self.weight(body)) + self.force_scale * torch.tanh(self.acceleration)
+        # Nearly one at initialisation; it may remove motion, never add any: a long rollout cannot feed on itself.
+        keep = torch.sigmoid(self.damping(body) + 5.0)
+        weight, torque = weight * there[..., None], torque * there[..., None]
+        return replace(
+            motion,
+            displacements=motion.displacements * keep[..., :1] + push * there[..., None] + weight,
+            spins=motion.spins * keep[..., 1:] + rotate(inertia.inverse_turning, torque),
+        )
+
+
+def _mlp(input_dim: int, hidden_dim: int, output_dim: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(input_dim, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, output_dim), nn.LayerNorm(output_dim)
+    )

@@ -1,0 +1,340 @@
+"""Contact: bodies kept out of what stands still and out of one another, with friction and bounce."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, Push, matrices_of, vectors_of
+from vpd_lightning.dynamics.inertial.materials import Materials
+from vpd_lightning.dynamics.inertial.rigid_motion import cross, rotate, rotation_from_spin
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """For each probe: signed distance (metres, positive outside), surface normal, and lateral offset (metres)."""
+
+    distances: Float[Tensor, "batch probe"]
+    normals: Float[Tensor, "batch probe 3"]
+    lateral: Float[Tensor, "batch probe"]
+
+    def first(self, count: int) -> "Contacts":
+        """Return those of the first probes."""
+        return Contacts(self.distances[:, :count], self.normals[:, :count], self.lateral[:, :count])
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """A step after contact: how far bodies go in it, and with what velocity they go on from it."""
+
+    step: BodyMotion
+    onward: BodyMotion
+    touching: Bool[Tensor, "batch body 1"]
+
+
+@dataclass(frozen=True)
+class _Touch:
+    """One resolved contact of each body, to be looked at again for the velocity after the impact."""
+
+    arms: Float[Tensor, "batch body 3"]
+    normals: Float[Tensor, "batch body 3"]
+    approach: Float[Tensor, "batch body 1"]
+    is_active: Bool[Tensor, "batch body 1"]
+
+
+@dataclass(frozen=True)
+class ContactPoints:
+    """Points of bodies that may touch something; ``members`` is 1 where a point belongs to a body, else 0."""
+
+    positions: Float[Tensor, "batch probe 3"]
+    normals: Float[Tensor, "batch probe 3"]
+    members: Float[Tensor, "batch body probe"]
+
+    @property
+    def bodies(self) -> Int[Tensor, "batch probe"]:
+        """Return the body of each point; 0 where it has none."""
+        return self.members.argmax(dim=1)
+
+
+@dataclass(frozen=True)
+class BodyContacts:
+    """For each probe: the nearest probe of another body whose normal is known, and whether that says anything."""
+
+    other: Int[Tensor, "batch probe"]
+    known: Bool[Tensor, "batch probe"]
+
+
+def nearest_static_contacts(
+    probes: Float[Tensor, "batch probe 3"],
+    static_positions: Float[Tensor, "batch particle 3"],
+    static_normals: Float[Tensor, "batch particle 3"],
+    static_mask: Bool[Tensor, "batch particle"],
+    far: float,
+) -> Contacts:
+    """Measure each probe against the tangent plane of its nearest static particle whose normal is known.
+
+    The point-to-plane distance is exact on flat surfaces however sparse the particles are. Without any static
+    particle, or beyond ``far`` metres, the distance is ``far`` and the normal zero: no contact.
+    """
+    oriented = static_mask & (static_normals.square().sum(dim=-1) > 0.5)
+    index, exists = _nearest(probes, static_positions, oriented[:, None])
+    normals, offsets = vectors_of(static_normals, index), probes - vectors_of(static_positions, index)
+    distances = (offsets * normals).sum(dim=-1)
+    lateral = (offsets - distances[..., None] * normals).square().sum(dim=-1).clamp(min=1e-12).sqrt()
+    known = exists & (offsets.square().sum(dim=-1) < far**2)
+    return Contacts(
+        distances=torch.where(known, distances, torch.full_like(distances, far)),
+        normals=normals * known[..., None],
+        lateral=torch.where(known, lateral, torch.full_like(lateral, far)),
+    )
+
+
+@torch.no_grad()
+def nearest_body_contacts(
+    points: ContactPoints,
+    reach: Float[Tensor, " batch"],
+    max_depth: Float[Tensor, "batch probe"],
+) -> BodyContacts:
+    """Find for each probe the surface of another body that it may touch.
+
+    A probe that lies beside the surface's nearest point by more than ``reach`` (metres) is not above that surface, and
+    one deeper below it than its ``max_depth`` came from the other side.
+    """
+    positions, normals, is_owned = points.positions, points.normals, points.members.any(dim=1)
+    bodies = torch.where(is_owned, points.bodies, -1)
+    oriented = is_owned & (normals.square().sum(dim=-1) > 0.5)
+    different = (bodies[:, :, None] != bodies[:, None]) & oriented[:, None] & is_owned[:, :, None]
+    other, exists = _nearest(positions, positions, different)
+    offset = positions - vectors_of(positions, other)
+    height = (offset * vectors_of(normals, other)).sum(dim=-1)
+    beside = offset.square().sum(dim=-1) - height.square()
+    known = exists & (beside < reach[:, None].square()) & (height > -max_depth)
+    return BodyContacts(other, known)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """One contact of every ordered pair of bodies; those that do not touch are inactive."""
+
+    first: Int[Tensor, "batch pair"]
+    second: Int[Tensor, "batch pair"]
+    first_arms: Float[Tensor, "batch pair 3"]
+    second_arms: Float[Tensor, "batch pair 3"]
+    normals: Float[Tensor, "batch pair 3"]
+    approach: Float[Tensor, "batch pair 1"]
+    is_active: Bool[Tensor, "batch pair 1"]
+
+    def sides(self) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        return (self.first, self.first_arms), (self.second, self.second_arms)
+
+    def relative(self, motion: BodyMotion) -> Float[Tensor, "batch pair 3"]:
+        """Return the velocity (metres per step) of the first body's point as seen from the second's."""
+        first, second = (_velocity(_gathered(_as_push(motion), index), arms) for index, arms in self.sides())
+        return first - second
+
+    @property
+    def touching(self) -> Bool[Tensor, "batch body 1"]:
+        """Whether each body is in any active pair."""
+        count = round(self.first.shape[1] ** 0.5)
+        active = self.is_active.view(-1, count, count)
+        return (active.any(dim=1) | active.any(dim=2))[..., None]
+
+
+class ContactSolver:
+    """Corrects the motion of one step so that no probe ends up inside what stands still or inside another body.
+
+    Position-based dynamics (Mueller et al. 2007, 2020): each round takes the deepest probe of each body and applies
+    the smallest push at that point that lifts it out, to displacement, spin and stretch alike, and a push against its
+    sliding of at most friction times that (Coulomb). Bodies push each other with equal and opposite impulses, so that
+    momentum is kept. What is carried on to the next step has lost the motion into the surface, but for the share that
+    restitution gives back of what came faster than ``rest_speed`` (metres per step). Probes that were deeper than
+    ``max_depth`` (metres) before the step are left alone: their surface is not to be trusted.
+    """
+
+    def __init__(
+        self,
+        *,
+        points: ContactPoints,
+        centers: Float[Tensor, "batch body 3"],
+        inertia: Inertia,
+        materials: Materials,
+        masses: Float[Tensor, "batch body 1"],
+        rest_speed: float,
+    ):
+        self.points, self.own = points, points.bodies
+        self.offsets = points.positions - vectors_of(centers, self.own)
+        self.inertia, self.materials, self.masses, self.rest_speed = inertia, materials, masses, rest_speed
+
+    def resolve(
+        self,
+        free: BodyMotion,
+        static: Contacts,
+        between: BodyContacts | None,
+        *,
+        num_iterations: int,
+        max_depth: float,
+    ) -> Resolved:
+        """Return the step without penetration; ``static`` says what stands still near each point."""
+        known = (static.normals.square().sum(dim=-1) > 0.5) & (static.distances > -max_depth)
+        touchable = (self.points.members > 0) & known[:, None]
+        motion, touches = free, []
+        touching = torch.zeros_like(self.masses, dtype=torch.bool)
+        pairs: list[_Pairs] = []
+        for _ in range(num_iterations):
+            if between is not None:
+                motion, pair = self._part(motion, free, between)
+                pairs.append(pair)
+                touching = touching | pair.touching
+            motion, touch = self._lift(motion, free, static, touchable)
+            touches.append(touch)
+            touching = touching | touch.is_active
+        onward = motion
+        for pair in pairs:
+            onward = self._bounce_apart(onward, pair)
+        for touch in touches:
+            onward = self._bounce(onward, touch)
+        return Resolved(motion, onward, touching)
+
+    def _lift(
+        self, motion: BodyMotion, free: BodyMotion, contacts: Contacts, touchable: Tensor
+    ) -> tuple[BodyMotion, _Touch]:
+        """Lift the deepest point of each body out of what stands still, and slow its sliding."""
+        turned = motion.turned(self.offsets, self.own)
+        moves = vectors_of(motion.displacements, self.own) + turned - self.offsets
+        ahead = contacts.distances + (moves * contacts.normals).sum(dim=-1)
+        deepest, probe = ahead[:, None].masked_fill(~touchable, torch.inf).min(dim=-1)
+        deepest = deepest[..., None]
+        normal, arm, move = (vectors_of(values, probe) for values in (contacts.normals, turned, moves))
+        lift = torch.relu(-deepest) / self.inertia.response(arm, normal)
+        push = self.inertia.push(arm, lift * normal)
+        motion = motion.pushed(push)
+
+        move = move + _velocity(push, arm)
+        sliding = move - (move * normal).sum(dim=-1, keepdim=True) * normal
+        speed = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+        direction = sliding / speed
+        stop = speed / self.inertia.response(arm, direction)
+        drag = -torch.minimum(stop, self.materials.friction * lift) * direction
+        motion = motion.pushed(self.inertia.push(arm, drag))
+        approach = -(_velocity(_as_push(free), arm) * normal).sum(dim=-1, keepdim=True)
+        return motion, _Touch(arm, normal, approach, (lift > 0) & torch.isfinite(deepest))
+
+    def _bounce(self, motion: BodyMotion, touch: _Touch) -> BodyMotion:
+        """Give back a share of the approach, or at least take all of it away."""
+        speed = (_velocity(_as_push(motion), touch.arms) * touch.normals).sum(dim=-1, keepdim=True)
+        wanted = self.materials.restitution * torch.relu(touch.approach - self.rest_speed)
+        lift = torch.relu(wanted - speed) / self.inertia.response(touch.arms, touch.normals)
+        return motion.pushed(self.inertia.push(touch.arms, lift * touch.is_active * touch.normals))
+
+    def _part(self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts) -> tuple[BodyMotion, "_Pairs"]:
+        """Push apart each pair of bodies at its deepest contact, half as far as needed from either side."""
+        own, turned = self.own, motion.turned(self.offsets, self.own)
+        there = vectors_of(motion.centers + motion.displacements, own) + turned
+        facing = rotate(matrices_of(rotation_from_spin(motion.spins), own), self.points.normals)
+        facing = vectors_of(facing, contacts.other)
+        gaps = ((there - vectors_of(there, contacts.other)) * facing).sum(dim=-1)
+        count = self.points.members.shape[1]
+        bodies = torch.arange(count, device=own.device)
+        from_first = own[:, None, None] == bodies[:, None, None]
+        to_second = torch.gather(own, 1, contacts.other)[:, None, None] == bodies[:, None]
+        usable = contacts.known[:, None, None] & from_first & to_second  # batch body body probe
+        deepest, probe = gaps[:, None, None].expand(usable.shape).masked_fill(~usable, torch.inf).min(dim=-1)
+        depth, probe = torch.relu(-deepest).flatten(1)[..., None], probe.flatten(1)
+        first, second = (
+            index.expand(len(own), -1) for index in (bodies.repeat_interleave(count), bodies.repeat(count))
+        )
+        # Both bodies are pushed at one place, between the two points: at two, they would be turned out of nothing.
+        place = (vectors_of(there, probe) + vectors_of(there, torch.gather(contacts.other, 1, probe))) / 2
+        centers = motion.centers + motion.displacements
+        pairs = _Pairs(
+            first=first,
+            second=second,
+            first_arms=place - vectors_of(centers, first),
+            second_arms=place - vectors_of(centers, second),
+            normals=vectors_of(facing, probe),
+            approach=torch.zeros_like(depth),
+            is_active=depth > 0,
+        )
+        pairs = replace(pairs, approach=-(pairs.relative(free) * pairs.normals).sum(dim=-1, keepdim=True))
+        impulse = 0.5 * depth / self._pair_response(pairs, pairs.normals)
+        sliding = pairs.relative(motion)
+        sliding = sliding - (sliding * pairs.normals).sum(dim=-1, keepdim=True) * pairs.normals
+        speed = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+        direction = sliding / speed
+        friction = self._pair_mean(self.materials.friction, pairs)
+        drag = torch.minimum(0.5 * speed / self._pair_response(pairs, direction), friction * impulse)
+        return self._pair_pushed(motion, pairs, impulse * pairs.normals - drag * direction), pairs
+
+    def _bounce_apart(self, motion: BodyMotion, pairs: "_Pairs") -> BodyMotion:
+        """Give back a share of the approach of two bodies, or at least take all of it away."""
+        speed = (pairs.relative(motion) * pairs.normals).sum(dim=-1, keepdim=True)
+        wanted = self._pair_mean(self.materials.restitution, pairs) * torch.relu(pairs.approach - self.rest_speed)
+        impulse = 0.5 * torch.relu(wanted - speed) / self._pair_response(pairs, pairs.normals)
+        return self._pair_pushed(motion, pairs, impulse * pairs.is_active * pairs.normals)
+
+    @staticmethod
+    def _pair_mean(values: Tensor, pairs: "_Pairs") -> Tensor:
+        """Return the geometric mean of what two bodies are made of."""
+        return (vectors_of(values, pairs.first) * vectors_of(values, pairs.second)).clamp(min=1e-12).sqrt()
+
+    def _pair_response(self, pairs: "_Pairs", directions: Tensor) -> Tensor:
+        """Return how far two bodies part, each at its contact, for a unit impulse."""
+        each = [
+            self.inertia.gathered(index).response(arm, directions) / vectors_of(self.masses, index)
+            for index, arm in pairs.sides()
+        ]
+        return each[0] + each[1]
+
+    def _pair_pushed(self, motion: BodyMotion, pairs: "_Pairs", impulses: Tensor) -> BodyMotion:
+        for sign, (index, arm) in zip((1, -1), pairs.sides(), strict=True):
+            push = self.inertia.gathered(index).push(arm, sign * impulses / vectors_of(self.masses, index))
+            motion = motion.pushed(_summed(push, index, self.points.members.shape[1]))
+        return motion
+
+
+@torch.no_grad()
+def _nearest(
+    queries: Float[Tensor, "batch query 3"],
+    points: Float[Tensor, "batch point 3"],
+    usable: Bool[Tensor, "batch any point"],
+) -> tuple[Int[Tensor, "batch query"], Bool[Tensor, "batch query"]]:
+    """Return the nearest usable point of each query and whether there is one.
+
+    The product form of the squared distance, in half the time of differences, finds the two nearest, and differences
+    decide between them: two points may be equally far, and rounding must not choose.
+    """
+    origin = queries.mean(dim=1, keepdim=True)
+    local, others = queries - origin, points - origin
+    order = torch.baddbmm(others.square().sum(dim=-1)[:, None], local, others.mT, alpha=-2)
+    lowest, index = order.masked_fill(~usable, torch.inf).topk(min(2, order.shape[-1]), dim=-1, largest=False)
+    index = index.sort(dim=-1).values  # of equally far ones the first
+    gaps = queries[:, :, None] - vectors_of(points, index.flatten(1)).unflatten(1, index.shape[1:])
+    square = gaps.square().sum(dim=-1)
+    exists = torch.isfinite(lowest[..., :1])
+    chosen = torch.gather(usable.expand(order.shape), 2, index)
+    which = square.masked_fill(~chosen, torch.inf).argmin(dim=-1, keepdim=True)
+    return torch.gather(index, 2, which).squeeze(-1), exists.squeeze(-1)
+
+
+def _as_push(motion: BodyMotion) -> Push:
+    return Push(motion.displacements, motion.spins, motion.strains)
+
+
+def _velocity(push: Push, arms: Tensor) -> Tensor:
+    """Return the velocity (metres per step) of the point at an arm."""
+    return push.displacements + cross(push.spins, arms) + rotate(push.strains, arms)
+
+
+def _gathered(push: Push, index: Tensor) -> Push:
+    return Push(vectors_of(push.displacements, index), vectors_of(push.spins, index), matrices_of(push.strains, index))
+
+
+def _summed(push: Push, index: Tensor, count: int) -> Push:
+    """Add up pushes (``batch contact``) by the body they act on."""
+
+    def add(values: Tensor) -> Tensor:
+        flat = index.reshape(*index.shape, *[1] * (values.dim() - 2)).expand_as(values)
+        return values.new_zeros(len(values), count, *values.shape[2:]).scatter_add(1, flat, values)
+
+    return Push(add(push.displacements), add(push.spins), add(push.strains))

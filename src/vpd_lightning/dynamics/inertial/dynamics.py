@@ -1,0 +1,382 @@
+"""Inertial dynamics: what moves keeps moving, as rigid or soft bodies; networks learn forces and materials."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from vpd_lightning.dynamics.base import AbstractDynamics
+from vpd_lightning.dynamics.inertial.body_forces import BodyForces
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, matrices_of, vectors_of
+from vpd_lightning.dynamics.inertial.contact import (
+    BodyContacts,
+    ContactPoints,
+    ContactSolver,
+    Resolved,
+    nearest_body_contacts,
+    nearest_static_contacts,
+)
+from vpd_lightning.dynamics.inertial.first_motion import find_first_motion, gather_index, movable, observed, put, take
+from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity, Surfels, point_spacing
+from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
+from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, fit_twists, rotate, rotation_from_spin
+from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
+from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.types import Particles
+
+_PAIR_REACH = 1.5
+"""Spacings beside the nearest particle of another body within which that still says where its surface is."""
+
+
+_BOUNCE_SHARE = 0.3
+"""Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, or nothing ever lay still."""
+
+
+@dataclass(frozen=True)
+class InertialMemory:
+    """What the inertial dynamics carries from step to step; gathered over the particles that may move."""
+
+    origin: Float[Tensor, "batch 1 3"]  # where all else is measured from (world coordinates)
+    index: Int[Tensor, "batch moving"]  # slots of the moving candidates among all particles
+    mask: Bool[Tensor, "batch moving"]
+    bodies: Float[Tensor, "batch body moving"]  # 1 where a particle belongs to a body, else 0
+    own: Int[Tensor, "batch moving"]  # the number of that body; 0 for padding
+    motion: BodyMotion  # the velocity with which bodies go into the next step
+    materials: Materials
+    masses: Float[Tensor, "batch body 1"]
+    spacing: Float[Tensor, " batch"]  # of the moving candidates (metres)
+    normals: Float[Tensor, "batch moving 3"]
+    velocities: Float[Tensor, "batch moving 3"]  # metres a step, where each particle goes on by itself
+    mirrored: Bool[Tensor, "batch moving"]  # whose mirror image may be a point of the hidden side
+    first_features: Float[Tensor, "batch moving feature"]
+    first_shade: Float[Tensor, "batch moving feature"]
+    static_index: Int[Tensor, "batch static"]
+    static_mask: Bool[Tensor, "batch static"]
+    static_features: Float[Tensor, "batch static feature"]
+    static_shade: Float[Tensor, "batch static feature"]  # with the moving ones where they were at first
+
+
+class InertialDynamics(AbstractDynamics):
+    """Newton's first law built in, the second learned.
+
+    What may move is divided into bodies (``graph.bodies``); ``first_velocity`` says how each moved between the two
+    frames. Each step goes on with the carried velocity, lets ``BodyForces`` push, lets what is stretched return, keeps
+    bodies out of what stands still and of one another (``ContactSolver``), and moves their particles. How a body
+    slides, bounces, weighs and deforms is inferred from its features (``MaterialNetwork``). A body that touches
+    something and hardly moves stops (``rest_share`` of ``force_scale``). Particles that are not candidates for motion
+    keep their place exactly. Features change only by shading: a turned surface, a moved shadow.
+
+    Neither gravity nor a floor is built in: at initialisation this is free motion that contact alone changes, but for
+    0.7 % of damping a step.
+
+    For comparisons, each part can be left out: with ``first_velocity`` null bodies start at rest; with ``keep_shape``
+    false every particle goes on with its own velocity, to which it adds what its body's changes by; with
+    ``carry_memory`` false velocities and bodies are found anew from every two predicted frames; with ``rest_share``
+    zero nothing stops.
+    """
+
+    # Paper: the dynamics is a hierarchical GNN without velocities or correspondences; this one is ours
+    # (docs/architecture.md). It uses no privileged information.
+
+    def __init__(
+        self,
+        *,
+        feature_dim: int,
+        hidden_dim: int,
+        num_bodies: int,
+        body_link: float,
+        max_concavity: float,
+        max_concave_share: float,
+        first_velocity: FirstVelocity | None,
+        num_probes: int,
+        message_passing_steps: int,
+        num_forces: int,
+        location_scale: float,
+        force_scale: float,
+        residual_share: float,
+        contact_range: float,
+        contact_reach: float,
+        num_contact_iterations: int,
+        max_contact_depth: float,
+        mirror_hidden: bool,
+        is_soft: bool,
+        rest_share: float,
+        keep_shape: bool,
+        carry_memory: bool,
+        shadow_scales: Sequence[float],
+    ):
+        super().__init__()
+        for name, value in (("num_bodies", num_bodies), ("num_probes", num_probes)):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        for name, scale in (("body_link", body_link), ("location_scale", location_scale), ("force_scale", force_scale)):
+            if scale <= 0:
+                raise ValueError(f"{name} must be positive, got {scale}")
+        if rest_share < 0 or residual_share < 0:
+            raise ValueError(
+                f"rest_share and residual_share must not be negative, got {rest_share} and {residual_share}"
+            )
+        self.num_bodies, self.num_probes = num_bodies, num_probes
+        self.body_link, self.max_concavity, self.max_concave_share = body_link, max_concavity, max_concave_share
+        self.force_scale, self.rest_share = force_scale, rest_share
+        self.contact_range, self.contact_reach = contact_range, contact_reach
+        self.num_contact_iterations, self.max_contact_depth = num_contact_iterations, max_contact_depth
+        self.mirror_hidden, self.keep_shape, self.carry_memory = mirror_hidden, keep_shape, carry_memory
+        self.first_velocity = first_velocity
+        self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
+        self.forces = BodyForces(
+            hidden_dim=hidden_dim,
+            message_passing_steps=message_passing_steps,
+            num_forces=num_forces,
+            location_scale=location_scale,
+            force_scale=force_scale,
+            residual_share=residual_share,
+            contact_range=contact_range,
+        )
+        self.materials = MaterialNetwork(feature_dim=feature_dim, hidden_dim=hidden_dim, is_soft=is_soft)
+        self.moving_shading = MovingShading(feature_dim=feature_dim, hidden_dim=hidden_dim)
+        self.static_shading = StaticShading(feature_dim=feature_dim, hidden_dim=hidden_dim, scales=shadow_scales)
+
+    def initialize(self, previous: Particles, current: Particles, keys: RandomKeys) -> InertialMemory:
+        """Divide what may move into bodies, and estimate their first velocities."""
+        previous, current = observed(previous, current)
+        with torch.autocast(current.positions.device.type, enabled=False):  # geometry in full precision
+            return self._first_memory(previous, current)
+
+    def _first_memory(self, previous: Particles, current: Particles) -> InertialMemory:
+        # Far from the world's origin coordinates have few digits left, so everything is seen from a particle's place:
+        # differences of near ones are exact.
+        index, _ = gather_index(movable(current))
+        origin = take(current.positions, index[:, :1]).detach()
+        previous, current = (replace(frame, positions=frame.positions - origin) for frame in (previous, current))
+        found = find_first_motion(
+            previous,
+            current,
+            num_bodies=self.num_bodies,
+            body_link=self.body_link,
+            max_concavity=self.max_concavity,
+            max_concave_share=self.max_concave_share,
+            first_velocity=self.first_velocity,
+        )
+        index, mask, seen, bodies = found.index, found.mask, found.seen, found.bodies
+        shares = bodies / bodies.sum(dim=-1, keepdim=True).clamp(min=1)
+        with torch.no_grad():
+            centers = equidistant_centers(seen.positions, seen.normals, shares)
+            static_index, static_mask = gather_index(current.mask & ~movable(current))
+            static_positions = take(current.positions, static_index)
+            mirrored = mask & self._may_be_hidden(current, seen, bodies, centers, static_index, static_mask)
+            spacing = point_spacing(seen.positions, mask)
+        materials = self.materials(seen.features, shares)
+        static_features = take(current.features, static_index)
+        return InertialMemory(
+            origin=origin,
+            index=index,
+            mask=mask,
+            bodies=bodies,
+            own=found.own,
+            motion=_first_motion(seen.positions, found.matched.displacements, shares, centers),
+            materials=materials,
+            masses=materials.density * _volumes(seen.positions, centers, shares),
+            spacing=spacing,
+            normals=seen.normals,
+            velocities=found.matched.displacements,
+            mirrored=mirrored,
+            first_features=seen.features,
+            first_shade=self.moving_shading(seen.features, seen.normals),
+            static_index=static_index,
+            static_mask=static_mask,
+            static_features=static_features,
+            static_shade=self.static_shading(static_features, static_positions, seen.positions, mask),
+        )
+
+    def _may_be_hidden(
+        self,
+        current: Particles,
+        seen: Surfels,
+        bodies: Tensor,
+        centers: Tensor,
+        static_index: Tensor,
+        static_mask: Tensor,
+    ) -> Bool[Tensor, "batch moving"]:
+        """Return whose mirror image through the centre does not lie inside what stands still: nothing can be there."""
+        mirrored = 2 * (bodies[..., None] * centers[:, :, None]).sum(dim=1) - seen.positions
+        places, normals = take(current.positions, static_index), take(current.normals, static_index)  # type: ignore[arg-type]
+        return nearest_static_contacts(mirrored, places, normals, static_mask, self.contact_reach).distances > 0
+
+    def forward(
+        self, previous: Particles, current: Particles, memory: Any, keys: RandomKeys, rollout_step: int
+    ) -> tuple[Particles, InertialMemory]:
+        """Advance one step; see the class."""
+        if current.num_particles == 0:
+            return current, memory
+        current = current.without_padding()
+        device_type = current.positions.device.type
+        with torch.autocast(device_type, enabled=False):  # geometry in full precision
+            if not self.carry_memory and rollout_step > 0:
+                memory = self._first_memory(*observed(previous, current))
+            return self._step(current, memory)
+
+    def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
+        positions = take(current.positions, memory.index) - memory.origin
+        static_positions = take(current.positions, memory.static_index) - memory.origin
+        resolved = self._resolved(positions, static_positions, current.normals, memory)  # type: ignore[arg-type]
+        step, onward = self._rested(resolved)
+        own = memory.own
+        moved = _carried(step, positions, own)
+        velocities = memory.velocities
+        if not self.keep_shape:
+            velocities = velocities + moved - _carried(memory.motion, positions, own)
+            moved = positions + velocities
+        following = torch.where(memory.mask[..., None], moved, positions)
+        turned = rotate(matrices_of(rotation_from_spin(step.spins), own), memory.normals)
+        all_positions = put(current.positions, memory.index, following + memory.origin, memory.mask)
+        features = self._shade(current, memory, static_positions, following, turned)
+        stretches, _ = step.following_stretches()
+        _, strains = onward.following_stretches()
+        onward = BodyMotion(step.centers + step.displacements, onward.displacements, onward.spins, stretches, strains)
+        memory = replace(memory, motion=onward, normals=turned, velocities=velocities)
+        # Observations turn with their bodies, or a memory built from these particles would see faces that are gone.
+        normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
+        return replace(current, positions=all_positions, features=features, normals=normals), memory
+
+    def _resolved(
+        self, positions: Tensor, static_positions: Tensor, normals: Tensor, memory: InertialMemory
+    ) -> Resolved:
+        """Return the step after forces, elastic return and contact."""
+        probes = slice(0, self.num_probes)
+        probe_positions, members = positions[:, probes], memory.bodies[:, :, probes]
+        materials = memory.materials
+        shares = memory.bodies / memory.bodies.sum(dim=-1, keepdim=True).clamp(min=1)
+        inertia = body_inertia(
+            positions, memory.motion.centers, shares, materials.softness, self.log_inertia_ratio.exp()
+        )
+        own = memory.own[:, probes]
+        offsets = probe_positions - vectors_of(memory.motion.centers, own)
+        moved = vectors_of(memory.motion.displacements, own) + memory.motion.turned(offsets, own) - offsets
+        statics = (static_positions, take(normals, memory.static_index), memory.static_mask, self.contact_reach)
+        points = self._contact_points(probe_positions, memory, members)
+        contacts = nearest_static_contacts(points.positions, *statics)
+        motion = self.forces(
+            probe_positions,
+            moved * memory.mask[:, probes, None],
+            contacts.first(probe_positions.shape[1]),
+            memory.mask[:, probes],
+            members,
+            memory.motion,
+            inertia,
+        )
+        motion = replace(motion, strains=_elastic(motion, materials))
+        solver = ContactSolver(
+            points=points,
+            centers=memory.motion.centers,
+            inertia=inertia,
+            materials=materials,
+            masses=memory.masses,
+            rest_speed=_BOUNCE_SHARE * self.force_scale,
+        )
+        return solver.resolve(
+            motion,
+            contacts,
+            self._between(points, memory),
+            num_iterations=self.num_contact_iterations,
+            max_depth=self.max_contact_depth,
+        )
+
+    def _contact_points(self, positions: Tensor, memory: InertialMemory, members: Tensor) -> ContactPoints:
+        """Return what may touch: the probes and, where their hidden sides are to be guessed, their mirror images.
+
+        Cameras above a body do not see what it will land on. Most bodies are alike on both sides of their centre.
+        """
+        normals = memory.normals[:, : self.num_probes]
+        if not self.mirror_hidden:
+            return ContactPoints(positions, normals, members)
+        centers = vectors_of(memory.motion.centers, memory.own[:, : self.num_probes])
+        mirrored = members * memory.mirrored[:, None, : self.num_probes]
+        return ContactPoints(
+            torch.cat([positions, 2 * centers - positions], dim=1),
+            torch.cat([normals, -normals], dim=1),
+            torch.cat([members, mirrored.to(members.dtype)], dim=2),
+        )
+
+    @staticmethod
+    def _between(points: ContactPoints, memory: InertialMemory) -> BodyContacts | None:
+        """Return where bodies may touch each other; None where there is nothing to touch, which saves the work."""
+        if points.members.shape[1] == 1:
+            return None
+        # No deeper than a third of a body: what lies deeper came from the other side.
+        size = (memory.masses / memory.materials.density).detach().clamp(min=1e-27) ** (1 / 3)
+        depth = (points.members * size).sum(dim=1) / 3
+        found = nearest_body_contacts(points, _PAIR_REACH * memory.spacing, depth)
+        return found if bool(found.known.any()) else None
+
+    def _rested(self, resolved: Resolved) -> tuple[BodyMotion, BodyMotion]:
+        """Stop what touches something and moves by less than a fraction of what a force does in a step.
+
+        Networks are never exactly zero, and a body at rest would creep; as static friction, this lets only what is
+        strong enough move it.
+        """
+        slowest = self.rest_share * self.force_scale
+        if slowest == 0:
+            return resolved.step, resolved.onward
+        gated = []
+        for motion in (resolved.step, resolved.onward):
+            # A turn counts by how far it moves what is a contact range away, which is of a body's size.
+            square = motion.displacements.square().sum(dim=-1, keepdim=True)
+            square = square + (0.2 * self.contact_range) ** 2 * motion.spins.square().sum(dim=-1, keepdim=True)
+            share = torch.where(resolved.touching, square / (square + slowest**2), 1.0)
+            gated.append(replace(motion, displacements=motion.displacements * share, spins=motion.spins * share))
+        return gated[0], gated[1]
+
+    def _shade(
+        self, current: Particles, memory: InertialMemory, static_positions: Tensor, following: Tensor, turned: Tensor
+    ) -> Tensor:
+        """Features are the observed ones plus what turned and what moved since; nothing accumulates."""
+        moving, static = memory.first_features, memory.static_features
+        moving = moving + (self.moving_shading(moving, turned) - memory.first_shade)
+        shade = self.static_shading(static, static_positions, following, memory.mask)
+        static = static + (shade - memory.static_shade)
+        features = put(current.features, memory.index, moving, memory.mask)
+        return put(features, memory.static_index, static, memory.static_mask)
+
+
+def _carried(motion: BodyMotion, positions: Tensor, own: Tensor) -> Float[Tensor, "batch moving 3"]:
+    """Return where points of bodies are after the step."""
+    offsets = positions - vectors_of(motion.centers, own)
+    return vectors_of(motion.centers + motion.displacements, own) + motion.turned(offsets, own)
+
+
+def _first_motion(positions: Tensor, displacements: Tensor, shares: Tensor, centers: Tensor) -> BodyMotion:
+    """Return the motion that the bodies arrived with: rigid, about their own centres."""
+    fitted = fit_twists(positions, displacements, shares)
+    # Fitted centres are those after the step, so the way back tells where each centre came from.
+    back = rotate(rotation_from_spin(-fitted.spins), centers - fitted.centers)
+    eye = torch.eye(3, dtype=positions.dtype, device=positions.device).expand(*centers.shape, 3)
+    there = (shares.sum(dim=-1) > 0)[..., None]
+    return BodyMotion(
+        centers=centers,
+        displacements=torch.where(there, centers - (fitted.centers - fitted.displacements + back), 0.0),
+        spins=torch.where(there, fitted.spins, 0.0),
+        stretches=eye,
+        strains=torch.zeros_like(eye),
+    )
+
+
+def _volumes(positions: Tensor, centers: Tensor, shares: Tensor) -> Float[Tensor, "batch body 1"]:
+    """Return the cube of each body's root mean square radius, to which its volume is in proportion (cubic metres).
+
+    A place without a body gets 1: masses are divided by.
+    """
+    offsets = positions[:, None] - centers[:, :, None]
+    square = (shares * offsets.square().sum(dim=-1)).sum(dim=-1, keepdim=True)
+    there = shares.sum(dim=-1, keepdim=True) > 0
+    return torch.where(there, square.clamp(min=1e-18), 1.0) ** 1.5
+
+
+def _elastic(motion: BodyMotion, materials: Materials) -> Float[Tensor, "batch body 3 3"]:
+    """Return the strains of a damped oscillation about the first shape; one semi-implicit step, stable for any."""
+    eye = torch.eye(3, dtype=motion.strains.dtype, device=motion.strains.device)
+    carried = motion.strains * (1 - materials.damping)[..., None]
+    return carried - materials.stiffness[..., None] * (motion.stretches - eye)

@@ -1,0 +1,1 @@
+"""Pictures, videos, camera paths, point files: what other programs and people look at."""

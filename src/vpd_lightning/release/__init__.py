@@ -1,0 +1,1 @@
+"""Models to give away: weights, configuration, card and an optional renderer program."""

@@ -1,0 +1,1 @@
+"""Features of query points, summed over the particles around them."""

@@ -1,0 +1,1 @@
+"""From features and positions to colour and density."""

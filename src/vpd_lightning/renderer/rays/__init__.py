@@ -1,0 +1,1 @@
+"""Samples and candidates along rays, and compositing."""

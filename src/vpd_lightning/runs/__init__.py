@@ -1,0 +1,1 @@
+"""Orchestrates trainings and evaluations as runs on disk: claim, resume, sweep, evaluate."""
