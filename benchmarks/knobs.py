@@ -60,8 +60,6 @@ RENDERER_KNOBS: dict[str, Sequence[Knob]] = {
         ),
         Knob("num_neighbors", ("num_neighbors",), (0.25, 0.5, 2.0), True),
         Knob("max_radius", ("max_radius",), (0.2, 0.4, 0.8, 1.6)),
-        Knob("early_stop", ("early_stop",), (1e-4, 1e-3, 1e-2, 5e-2)),
-        Knob("share_rows_below", ("share_rows_below",), (1e-4, 1e-3, 1e-2, 1e-1)),
         PARTICLES,
         PRECISION,
     ),
@@ -91,7 +89,7 @@ DYNAMICS_KNOBS: dict[str, Sequence[Knob]] = {
     ),
 }
 # Off: what leaves something out, and what could differ from the plain formula.
-_EXACT = {"max_radius": None, "early_stop": 0.0, "share_rows_below": None, "features_backend": "torch"}
+_EXACT = {"max_radius": None, "features_backend": "torch"}
 # The dense reference has this many times the samples, and candidates where a renderer looks at a few particles only.
 # What a field was trained to sum over (num_neighbors, the candidates of splat) defines it and stays.
 _MORE = {

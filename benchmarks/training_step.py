@@ -44,9 +44,6 @@ TINY = Scale(
     {"num_coarse_samples": 8, "num_fine_samples": 8, "net_width": 16, "net_width_condition": 8, "num_neighbors": 4},
 )  # fmt: skip
 
-# What the renderer may leave out within an error bound; keys that a version does not know are skipped.
-BOUNDED = {"early_stop": 1e-3, "max_radius": 2.0, "share_rows_below": 1e-3}
-
 EDGES_PER_NODE = 256  # room for edges among abstract nodes where shapes are fixed; surfaces have 90 to 160
 
 
@@ -54,8 +51,8 @@ class Step:
     """A training step of one variant.
 
     ``fast`` is our path with everything kept for the backward pass; ``plain`` the same weights on the plain path;
-    ``saving`` computes activations again instead of keeping them; ``bf16`` multiplies in bfloat16; ``bounded`` adds
-    the renderer's bounded omissions; ``surface`` has the other renderer, ``surface_bf16`` in bfloat16; ``compiled``
+    ``saving`` computes activations again instead of keeping them; ``bf16`` multiplies in bfloat16;
+    ``surface`` has the other renderer, ``surface_bf16`` in bfloat16; ``compiled``
     gives the dynamics fixed shapes and, on a GPU, hands it to torch.compile (a CUDA graph), in bfloat16.
     """
 
@@ -99,9 +96,6 @@ def build_simulator(variant: str, scale: Scale, is_gpu: bool) -> Simulator:
         option, renderer = "surface", {}
     else:
         renderer["checkpoint_chunks"] = saves
-    if variant == "bounded":
-        known = stages.section("renderer/point_nerf")
-        renderer |= {key: value for key, value in BOUNDED.items() if key in known}
     if variant == "compiled":
         dynamics |= {"edge_capacity": EDGES_PER_NODE * scale.abstract_nodes, "compile": is_gpu}
     return stages.build_simulator(

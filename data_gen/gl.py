@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data_gen.renderers import Labels
+from data_gen.labels import Labels
 from data_gen.scene_settings import CameraSettings
 
 _FAR_SHARE = 0.99  # sky comes back as the far plane

@@ -1,20 +1,12 @@
 """What a renderer is, and which one draws a compiled MuJoCo model."""
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_gen.labels import Labels
 from data_gen.scene_settings import SceneSettings
-
-
-@dataclass(frozen=True)
-class Labels:
-    """What the segmentation says where a MuJoCo object is seen: 0 background, i + 1 object i."""
-
-    geoms: NDArray[np.uint8]  # (model.ngeom,)
-    flexes: NDArray[np.uint8]  # (model.nflex,)
 
 
 class Renderer(Protocol):

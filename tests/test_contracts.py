@@ -65,7 +65,7 @@ SCENE = [
     "data.folder=nowhere",
     "run.folder=nowhere",
 ]
-# InertialDynamics sees the first num_probes and num_matched slots of what may move, VelocityGNNDynamics the latter;
+# InertialDynamics sees the first num_probes and num_matched slots of what may move;
 # beyond them the order of particles does matter, so both stay above 20 here.
 
 # What a class cannot satisfy, by its name, so that a new option of the same class needs no entry.
@@ -85,14 +85,11 @@ DEPARTURES = {
     "HierarchicalGNNDynamics": {
         "test_order_of_particles_does_not_matter": "abstract nodes are drawn among the slots of the current particles"
     },
-    "VelocityGNNDynamics": {
-        "test_order_of_particles_does_not_matter": "it wraps the graph network, whose abstract nodes are drawn so"
-    },
     "SleepingDynamics": {
         "test_order_of_particles_does_not_matter": "it wraps the graph network, whose abstract nodes are drawn so"
     },
 }
-NEEDS_OBSERVATIONS = {"InertialDynamics", "VelocityGNNDynamics"}
+NEEDS_OBSERVATIONS = {"InertialDynamics"}
 
 
 def options(group: str) -> list[str]:
@@ -194,8 +191,6 @@ class TestLosses(ChosenOption, LossContract):
         names = ("predicted_features", "target_features", "predicted_slots", "target_slots")
         auxiliary = {name: torch.rand(*shape, 5, 4, **draw) for name in names}
         auxiliary["point_mass"] = torch.rand(*shape, 5, **draw)
-        for name in ("previous_view_features", "view_features"):
-            auxiliary[name] = torch.randn(shape[0], 3, 4, **draw)
         for name in ("future_positions", "future_colors"):
             auxiliary[name] = torch.rand(*shape, 7, 3, **draw) - 0.5
         auxiliary["future_mask"] = torch.rand(*shape, 7, **draw) < 0.7

@@ -10,7 +10,7 @@ import torch
 
 import vpd_lightning
 from tests.evaluation.untrained_model import write_untrained
-from vpd_lightning.config.migrations import ADDED_SETTINGS
+from vpd_lightning.config.migrations import ADDED_SETTINGS, REMOVED_SETTINGS
 from vpd_lightning.dynamics.sleeping import SleepingDynamics
 from vpd_lightning.errors import CheckpointError, ConfigError
 from vpd_lightning.loading import find_device, load_model
@@ -97,11 +97,44 @@ def test_settings_that_came_later_mean_what_older_checkpoints_did(tmp_path: Path
     assert {name: loaded[name] for name in added} == added
 
 
-def test_every_added_setting_is_an_argument_of_its_class() -> None:
+def arguments_of(target: str) -> set[str]:
+    module, name = target.rsplit(".", 1)
+    return set(inspect.signature(getattr(import_module(module), name)).parameters)
+
+
+def test_every_added_setting_is_an_argument_of_its_class_and_no_removed_one_is() -> None:
     for target, settings in ADDED_SETTINGS.items():
-        module, name = target.rsplit(".", 1)
-        parameters = inspect.signature(getattr(import_module(module), name)).parameters
-        assert set(settings) <= set(parameters), target
+        assert set(settings) <= arguments_of(target), target
+    for target, settings in REMOVED_SETTINGS.items():
+        assert not set(settings) & arguments_of(target), target
+
+
+def with_settings(path: Path, section: str, **settings: object) -> Path:
+    content = load_checkpoint(path)
+    content["hyper_parameters"][section].update(settings)
+    write_checkpoint(content, path)
+    return path
+
+
+def test_settings_that_are_gone_are_left_out_where_they_were_off(tmp_path: Path) -> None:
+    path = write_untrained(tmp_path / "run", tmp_path)
+    expected = load_model(path).config
+    with_settings(path, "renderer", early_stop=0.0, num_stop_segments=7, share_rows_below=None)
+    assert load_model(path).config == expected
+
+
+@pytest.mark.parametrize("setting", [{"early_stop": 1e-3}, {"share_rows_below": 0.0}])
+def test_a_setting_that_is_gone_and_was_on_is_refused_by_name(tmp_path: Path, setting: dict) -> None:
+    path = with_settings(write_untrained(tmp_path / "run", tmp_path), "renderer", **setting)
+    with pytest.raises(CheckpointError, match=rf"renderer\.{next(iter(setting))}=.* no longer has"):
+        load_model(path)
+
+
+def test_a_class_that_is_gone_is_refused_by_name(tmp_path: Path) -> None:
+    path = write_untrained(tmp_path / "run", tmp_path)
+    with_settings(path, "dynamics", _target_="vpd_lightning.dynamics.velocity_gnn.VelocityGNNDynamics")
+    with pytest.raises(CheckpointError, match=r"dynamics is a .*VelocityGNNDynamics, which this version no longer has"):
+        load_model(path)
 
 
 def test_settings_of_a_trained_model_can_be_changed(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from data_gen.blender.extraction import AbstractScene, extract
 from data_gen.blender.process import BlenderProcess, shared_process
-from data_gen.renderers import Labels
+from data_gen.labels import Labels
 from data_gen.scene_settings import CameraSettings
 
 USE_DENOISER = True  # at 16 samples it comes as near to the converged picture as twice the samples, at the same cost

@@ -15,7 +15,8 @@ from data_gen.deformable.drop import Drop, draw_drop
 from data_gen.deformable.model import build_model, vertex_masses
 from data_gen.deformable.settings import DeformableSettings
 from data_gen.deformable.soft_bodies import SimulationFailedError, SoftBodies
-from data_gen.renderers import Labels, open_renderer
+from data_gen.labels import Labels
+from data_gen.renderers import open_renderer
 from data_gen.simulate_and_render import film, trajectory_of
 from data_gen.stage_clock import StageClock
 from vpd_lightning.data import schema

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.cameras import camera_xml, mjcf_numbers
+from data_gen.labels import Labels
 from data_gen.movi.contacts import Surface, option_xml, pair_xml
 from data_gen.movi.mesh_xml import mesh_xml, paint, part_attributes, texture_xml
 from data_gen.movi.settings import MoviSettings
 from data_gen.movi.surroundings import Surroundings, surroundings_assets, surroundings_bodies
 from data_gen.movi.throwing import ThrownObject
-from data_gen.renderers import Labels
 
 HIDDEN_GROUP = 3  # of what collides but is not seen; renderers draw groups 0 to 2
 # Of drawn spheres and cylinders: within 3 mm of a true sphere 1.4 m across. 64 and 32 (1.7 mm) cost a fifth more time.

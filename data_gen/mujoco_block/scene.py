@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from data_gen.cameras import camera_intrinsics, camera_poses, camera_xml
 from data_gen.cameras import mjcf_numbers as _text
+from data_gen.labels import Labels
 from data_gen.mujoco_block.settings import MujocoBlockSettings
-from data_gen.renderers import Labels, Renderer, open_renderer
+from data_gen.renderers import Renderer, open_renderer
 from data_gen.rigid_bodies import RigidBodies
 from data_gen.settings import SPLIT_CODES
 from data_gen.simulate_and_render import film, trajectory_of

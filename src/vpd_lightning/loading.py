@@ -62,7 +62,7 @@ def load_model(
 ) -> LoadedModel:
     """Load a simulator together with its configuration; see ``load``.
 
-    ``change`` replaces settings of its configuration, for example ``{"renderer": {"early_stop": 1e-3}}``: what does not
+    ``change`` replaces settings of its configuration, for example ``{"renderer": {"max_radius": 1.6}}``: what does not
     touch the weights may differ from training. ``sleeping`` leaves what has come to rest out of rollouts (approximate,
     see ``dynamics.sleeping``); it comes before ``change``, which may then set ``dynamics.rest_speed`` and the like.
 
@@ -85,7 +85,10 @@ def load_model(
         refuse_references(stored.config, "hyper_parameters")
     except ConfigError as error:
         raise CheckpointError(f"{path} may not be loaded.\n{error}") from error
-    config = upgraded(stored.config)
+    try:
+        config = upgraded(stored.config)
+    except ConfigError as error:
+        raise CheckpointError(f"{path} describes a model that this version cannot build.\n{error}") from error
     if sleeping and not config.get("dynamics"):
         raise ConfigError(f"sleeping=true needs particles, and {path} has none.\nLeave it away.")
     if sleeping:

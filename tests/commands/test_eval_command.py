@@ -13,10 +13,10 @@ import vpd_lightning
 from tests.evaluation.tossed_box import write_tossed_boxes
 from tests.evaluation.untrained_model import write_untrained
 from tests.released_model import write_slotformer
-from vpd_lightning.commands.eval import choose_protocol, main
+from vpd_lightning.commands.eval import main
 from vpd_lightning.config import compose
 from vpd_lightning.errors import ConfigError
-from vpd_lightning.runs.evaluation_run import run_evaluation, training_of
+from vpd_lightning.runs.evaluation_run import choose_protocol, run_evaluation, training_of
 from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 

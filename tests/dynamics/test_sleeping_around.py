@@ -196,7 +196,7 @@ def test_state_dict_is_that_of_the_wrapped_dynamics_and_loads_both_ways():
         wrapped.load_state_dict({})
 
 
-@pytest.mark.parametrize("name", ["hierarchical_gnn_small", "hierarchical_gnn_velocity_small", "inertial"])
+@pytest.mark.parametrize("name", ["hierarchical_gnn_small", "inertial"])
 def test_a_trained_models_configuration_takes_sleeping_afterwards(name):
     config = compose("train", ["experiment=demo", f"dynamics={name}"])
     changed = with_sleeping(config, {"rest_steps": 4})

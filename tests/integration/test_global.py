@@ -7,9 +7,8 @@ from typing import Any
 import torch
 
 from tests.data.recordings import make_trajectory
-from vpd_lightning.config import build_list, build_simulator, compose
+from vpd_lightning.config import build_simulator, compose
 from vpd_lightning.geometry.cameras import pixel_rays
-from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.losses.pixel import PixelLoss
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.simulator import Simulator
@@ -87,18 +86,6 @@ def test_the_picture_of_the_sixth_step_teaches_the_residual_network() -> None:
         for name, parameter in part.named_parameters():
             assert parameter.grad is not None and parameter.grad.isfinite().all(), name
         assert all(p.grad.any() for name, p in part.named_parameters() if "density" not in name)
-
-
-def test_time_contrast_teaches_what_sees_single_views_and_nothing_else() -> None:
-    config = compose("train", [*SMALL, *PLACED, "loss=pixel_and_time_contrast"])
-    losses = {loss.name: loss for loss in build_list(config["loss"], AbstractLoss, "loss")}
-    simulator, batch = simulator_of(), batch_of(1)
-
-    losses["time_contrastive"](simulator(batch), batch).backward()
-
-    taught = {name.rsplit(".", 2)[0] for name, p in simulator.named_parameters() if p.grad is not None and p.grad.any()}
-    assert any(name.startswith("encoder.trunk") for name in taught) and "encoder.view_network" in taught
-    assert all(name.startswith("encoder") and "state_network" not in name for name in taught)
 
 
 def test_states_keep_unit_length_over_a_long_rollout_and_depth_is_never_looked_at() -> None:

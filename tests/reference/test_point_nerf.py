@@ -26,7 +26,7 @@ def _renderer() -> PointNeRFRenderer:
         skip_layer=4, net_width_condition=5, view_degree=VIEW_DEGREE, density_activation="relu",
         kernel_normalization=None, normalization_epsilon=1e-6, feature_network=None,
         neighbors_backend="auto", features_backend="auto", sort_particles=True, reuse_coarse=True, max_radius=None,
-        early_stop=0.0, num_stop_segments=4, share_rows_below=None, ray_chunk_size=3, checkpoint_chunks=True,
+        ray_chunk_size=3, checkpoint_chunks=True,
     )  # fmt: skip
     for parameter in renderer.parameters():
         nn.init.normal_(parameter, std=0.5, generator=torch.Generator().manual_seed(parameter.numel()))

@@ -28,9 +28,6 @@ SMALL = {
     "sort_particles": True,
     "reuse_coarse": True,
     "max_radius": None,
-    "early_stop": 0.0,
-    "num_stop_segments": 4,
-    "share_rows_below": None,
     "ray_chunk_size": 1000,
     "checkpoint_chunks": False,
 }

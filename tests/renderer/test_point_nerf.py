@@ -146,10 +146,8 @@ def test_geometry_stays_in_float32_under_autocast() -> None:
         ("ray_chunk_size", 0),
         ("neighbors_backend", "faiss"),
         ("features_backend", "faiss"),
-        ("early_stop", 1.0),
-        ("num_stop_segments", 0),
         ("max_radius", -0.1),
-        ("share_rows_below", float("nan")),
+        ("max_radius", float("nan")),
         ("kernel_bandwidths", (0.1,)),
     ],
 )

@@ -44,7 +44,7 @@ def test_scenes_with_hardly_a_particle_stay_the_same(switches: dict, count: int)
 
 
 def test_switches_do_not_change_the_state_dict() -> None:
-    plain, switched = renderer_of(**OFF), renderer_of(early_stop=0.1, max_radius=1.0, share_rows_below=0.0)
+    plain, switched = renderer_of(**OFF), renderer_of(max_radius=1.0)
     assert plain.state_dict().keys() == switched.state_dict().keys()
 
 
@@ -77,6 +77,6 @@ def test_the_fine_tier_at_given_places_is_the_fine_tier() -> None:
 
 def test_no_rays_are_no_problem() -> None:
     rays = rays_of(count=0)
-    for changes in ({}, {"early_stop": 0.1, "share_rows_below": 0.0}):
+    for changes in ({}, {"max_radius": 0.3}):
         with torch.no_grad():
             assert renderer_of(**changes)(scene(), rays, None).rgbs.shape == (2, 0, 3)

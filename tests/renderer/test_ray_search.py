@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from vpd_lightning.errors import NonFiniteError
-from vpd_lightning.renderer.kernels.ray_search import BesideAndBehind, BesideRay, RaySearch, check_backend, smallest
+from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend, smallest
+from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind, BesideRay
 
 BACKENDS = ["torch", pytest.param("numba", marks=pytest.mark.skipif(not find_spec("numba"), reason="needs numba"))]
 SCORES = [BesideRay(0.5, 6.0), BesideRay(2.5, 3.2), BesideAndBehind(0.5, 0.05, 0.3), BesideAndBehind(2.9, 0.2, 0.0)]

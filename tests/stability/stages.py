@@ -48,7 +48,7 @@ LENGTHS = (  # options in metres, which grow with the world
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {  # switches that change how an option computes
     "point_nerf": {
         "all_switches_off": {"sort_particles": False, "reuse_coarse": False, "features_backend": "torch"},
-        "bounded": {"early_stop": 0.01, "num_stop_segments": 2, "max_radius": 0.4, "share_rows_below": 1e-3},
+        "bounded": {"max_radius": 0.4},
         "recomputed": {"checkpoint_chunks": True},
     },
     "surface": {"brute_force": {"candidate_backend": "torch"}},
@@ -56,10 +56,6 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {  # switches that change how a
     "hierarchical_gnn": {
         "static_shapes": {"edge_capacity": 512},
         "nearest_abstract_nodes": {"max_abstract_edges_per_node": 4},
-    },
-    "hierarchical_gnn_velocity": {
-        "static_shapes": {"edge_capacity": 512},
-        "as_an_input_only": {"adds_velocity": False},
     },
 }
 

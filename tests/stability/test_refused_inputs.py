@@ -125,13 +125,10 @@ def test_dynamics_refuses_bad_particles(option: str, when: str, name: str, bad: 
     refused(lambda: stepped(dynamics, pair["previous"], pair["current"]), name)
 
 
-@pytest.mark.parametrize("option", ["inertial", "hierarchical_gnn_velocity"])
 @pytest.mark.parametrize("when, name", [("previous", "colors"), ("current", "colors"), ("current", "normals")])
-def test_inertial_dynamics_refuses_bad_observations(
-    option: str, when: str, name: str, bad: float, request: pytest.FixtureRequest
-):
+def test_inertial_dynamics_refuses_bad_observations(when: str, name: str, bad: float, request: pytest.FixtureRequest):
     known_fault(request, "inertial_unchecked")
-    dynamics, (previous, current) = stage("dynamics", option, FLOAT64, CPU), ball_particles()
+    dynamics, (previous, current) = stage("dynamics", "inertial", FLOAT64, CPU), ball_particles()
     pair = {"previous": previous, "current": current}
     values = getattr(pair[when], name).clone()
     values[-1, pair[when].moving[-1].nonzero()[0, 0], 0] = bad

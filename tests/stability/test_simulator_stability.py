@@ -14,7 +14,7 @@ from vpd_lightning.simulator import Scene, Simulator
 from vpd_lightning.testing.scenes import ring_cameras, video_batch
 from vpd_lightning.types import Particles, SimulatorOutput, VideoBatch
 
-READS_NORMALS = ("inertial", "hierarchical_gnn_velocity")
+READS_NORMALS = ("inertial",)
 # The paper's dynamics before every renderer, and every other dynamics before one of them.
 PAIRS = [("hierarchical_gnn", name) for name in options("renderer")] + [
     (name, "surface") for name in options("dynamics") if name not in ("hierarchical_gnn", *READS_NORMALS)
@@ -138,12 +138,6 @@ def test_autocast_and_float64_agree_with_float32(pair: tuple[str, str], device: 
 @pytest.mark.parametrize("renderer", options("renderer"))
 def test_inertial_dynamics_from_frames(renderer: str, mode: Mode, device: torch.device):
     model = simulator(("inertial", renderer), mode, device, encoder="unet", use_normals=True)
-
-    trained_one_step(model, batch_for(mode, device), mode, device)
-
-
-def test_velocities_for_the_paper_dynamics_from_frames(mode: Mode, device: torch.device):
-    model = simulator(("hierarchical_gnn_velocity", "surface"), mode, device, encoder="unet", use_normals=True)
 
     trained_one_step(model, batch_for(mode, device), mode, device)
 

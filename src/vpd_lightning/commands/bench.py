@@ -32,9 +32,9 @@ def _bench(config: Mapping[str, Any]) -> None:
     from benchmarks.measuring import Options
     from benchmarks.results_files import default_folder, write
     from benchmarks.suites import chosen, load
-    from vpd_lightning.commands.eval import set_threads
     from vpd_lightning.errors import OutOfMemoryError
     from vpd_lightning.loading import find_device
+    from vpd_lightning.runs.threads import set_threads
 
     wanted = config["suite"]
     names = chosen([str(name) for name in (wanted if isinstance(wanted, list) else [wanted])])

@@ -26,7 +26,6 @@ def _run(words: list[str]) -> int:
 def _render(config: Mapping[str, Any]) -> None:
     import torch
 
-    from vpd_lightning.commands.eval import set_threads
     from vpd_lightning.data.manifest import file_sha256
     from vpd_lightning.editing.colored_editor import colored_editor
     from vpd_lightning.editing.edit_files import load_edit, replay
@@ -39,6 +38,7 @@ def _render(config: Mapping[str, Any]) -> None:
     from vpd_lightning.release.results_folder import beside_checkpoint
     from vpd_lightning.runs.one_recording import choose_trajectory, data_set, load_particle_simulator
     from vpd_lightning.runs.progress import show_progress
+    from vpd_lightning.runs.threads import set_threads
 
     _check(config)
     set_threads(config["num_threads"])

@@ -62,9 +62,9 @@ def start(config: Mapping[str, Any]) -> Any:
 
 
 def _show(viewer: Any, config: Mapping[str, Any]) -> None:
-    from vpd_lightning.commands.eval import set_threads
     from vpd_lightning.release.results_folder import beside_checkpoint
     from vpd_lightning.runs.one_recording import choose_trajectory, data_set, load_particle_simulator
+    from vpd_lightning.runs.threads import set_threads
     from vpd_lightning.viewer.opened_scene import open_scene
 
     set_threads(config["num_threads"])

@@ -1,4 +1,4 @@
-"""Configurations of older checkpoints: what a setting that came later means for a model that never heard of it."""
+"""Configurations of older checkpoints: settings that came later, and settings and classes that are gone."""
 
 from collections.abc import Mapping
 from difflib import get_close_matches
@@ -9,6 +9,8 @@ from vpd_lightning.moved import current_name
 
 _RENDERER = "vpd_lightning.renderer."
 _DYNAMICS = "vpd_lightning.dynamics."
+_OLD_VERSION = "Use the version of vpd-lightning that trained it."
+ANY_VALUE = object()
 _PLAIN_FEATURES = {"kernel_normalization": None, "normalization_epsilon": 1e-6, "feature_network": None}
 
 ADDED_SETTINGS: dict[str, dict[str, Any]] = {
@@ -18,9 +20,6 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "sort_particles": True,
         "reuse_coarse": True,
         "max_radius": None,
-        "early_stop": 0.0,
-        "num_stop_segments": 4,
-        "share_rows_below": None,
         **_PLAIN_FEATURES,
     },
     f"{_DYNAMICS}hierarchical_gnn.HierarchicalGNNDynamics": {
@@ -44,17 +43,50 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
 """By class: arguments added since the first checkpoints, with values that leave those models as they were."""
 
 
-def upgraded(config: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Return a stored configuration with today's names of its classes and the settings they got since; values stay."""
+REMOVED_SETTINGS: dict[str, dict[str, Any]] = {
+    f"{_RENDERER}point_nerf.PointNeRFRenderer": {
+        "early_stop": 0.0,
+        "num_stop_segments": ANY_VALUE,  # without effect where early_stop was off
+        "share_rows_below": None,
+    },
+}
+"""By class: arguments of older checkpoints that are gone, with the value that meant "off"; on, they are refused."""
+
+REMOVED_CLASSES = (f"{_DYNAMICS}velocity_gnn.VelocityGNNDynamics",)
+"""Classes that older checkpoints may name. docs/benchmarks.md ("What was measured and left out") says why they went."""
+
+
+def upgraded(config: Mapping[Any, Any], where: str = "") -> dict[Any, Any]:
+    """Return a stored configuration as this version writes it; values given stay.
+
+    Settings that its classes have got since are added, and those that they have lost are left out where they were off.
+
+    Raises:
+        ConfigError: it names a class that is gone, or a setting that is gone and was on.
+    """
     result = {}
     for name, section in config.items():
         if isinstance(section, Mapping):
-            section = upgraded(section)
+            section = upgraded(section, f"{where}{name}.")
             if isinstance(section.get("_target_"), str):
                 section["_target_"] = current_name(section["_target_"])
-            section = {**ADDED_SETTINGS.get(str(section.get("_target_")), {}), **section}
+            target = str(section.get("_target_"))
+            if target in REMOVED_CLASSES:
+                raise ConfigError(f"{where}{name} is a {target}, which this version no longer has.\n{_OLD_VERSION}")
+            section = {**ADDED_SETTINGS.get(target, {}), **_without_removed(section, target, f"{where}{name}")}
         result[name] = section
     return result
+
+
+def _without_removed(section: Mapping[Any, Any], target: str, where: str) -> dict[Any, Any]:
+    removed = REMOVED_SETTINGS.get(target, {})
+    for name, off in removed.items():
+        if name in section and off is not ANY_VALUE and section[name] != off:
+            raise ConfigError(
+                f"{where}.{name}={section[name]} is a setting that this version no longer has (off was {off}).\n"
+                + _OLD_VERSION
+            )
+    return {name: value for name, value in section.items() if name not in removed}
 
 
 def changed(config: Mapping[str, Any], change: Any, where: str = "change") -> dict[str, Any]:

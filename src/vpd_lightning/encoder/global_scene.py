@@ -70,8 +70,6 @@ class GlobalSceneEncoder(AbstractEncoder):
     def forward(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> EncoderOutput:
         """Encode the frames of one time step (axes ``batch view``, any number of views in any order).
 
-        ``auxiliary["view_features"]`` (batch, view, ``hidden_dim``) holds what each view said.
-
         Raises:
             DataError: images of another size than the encoder was built for.
         """
@@ -90,7 +88,7 @@ class GlobalSceneEncoder(AbstractEncoder):
         state = self.state_network(views.mean(dim=1)).to(cam_to_world.dtype)
         features = nn.functional.normalize(state, dim=-1)[:, None]
         particles = Particles(positions=features.new_zeros(len(features), 1, 3), features=features)
-        return EncoderOutput(particles, {"view_features": views})
+        return EncoderOutput(particles)
 
     def _view_matrices(self, cam_to_world: Float[Tensor, "*camera 4 4"]) -> Float[Tensor, "*camera 16"]:
         """Return the flattened world-to-camera matrices, row by row, with scaled translations."""

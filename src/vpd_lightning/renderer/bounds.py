@@ -1,6 +1,6 @@
-"""How large the error of each bounded optimisation of ``PointNeRFRenderer`` can get, derived and computed.
+"""How large the error of ``max_radius`` of ``PointNeRFRenderer`` can get, derived and computed.
 
-All of these bound the difference to the same renderer without the optimisation, in exact arithmetic; rounding comes on
+All of these bound the difference to the same renderer without a radius, in exact arithmetic; rounding comes on
 top (about 1e-6 of a colour in float32).
 
 Notation, for one ray: optical depths ``tau_i = sigma_i dt_i``, transmittances ``T_i = exp(-sum_{j<i} tau_j)``, weights
@@ -30,27 +30,6 @@ class RenderingError:
     color: float
     depth: float
     opacity: float
-
-
-def early_stop_error(min_transmittance: float, near: float, far: float) -> RenderingError:
-    """Bound what ``early_stop=min_transmittance`` changes of a ray.
-
-    Samples from m on are left out because ``T_m < eps``. With ``C = sum_{i<m} w_i c_i + T_m B_{m-1}`` and what is
-    rendered instead, ``C' = sum_{i<m} w_i c_i + T_m c_{m-1}``,
-
-        |C - C'| = T_m |B_{m-1} - c_{m-1}| < eps    per channel, both being colours in [0, 1].
-
-    The expected distance is a mean too, of distances in [near, far]; what light is left is put at the last sample, as
-    always, which moves a share of ``T_m`` by at most ``far - near``. The opacity falls from ``1 - T_N`` to ``1 - T_m``,
-    by less than eps. Where no sample is left out nothing changes.
-
-    Gradients of the colour, per channel: for a sample that stays (i < m), ``dC/dtau_i = T_{i+1} (c_i - B_i)`` (derived
-    at ``rendering_error``), and of ``T_{i+1} B_i`` only its last summand, ``T_m B_{m-1}``, is replaced: the derivative
-    changes by less than eps. ``dC/dc_i = w_i`` stays, except that the last evaluated sample's takes ``T_m < eps`` more.
-    For a sample that is left out the derivative becomes 0 and was ``T_{j+1} |c_j - B_j| < eps`` with respect to
-    ``tau_j``, and less than eps for the colours of all of them together.
-    """
-    return RenderingError(min_transmittance, min_transmittance * (far - near), min_transmittance)
 
 
 def feature_error_bound(
@@ -104,11 +83,6 @@ def radius_for(
 def cut_norm(feature_errors: Sequence[float], feature_dim: int) -> float:
     """Return the Euclidean norm that errors of ``feature_error_bound`` in ``feature_dim`` channels each can have."""
     return math.sqrt(feature_dim * sum(error**2 for error in feature_errors))
-
-
-def shared_norm(threshold: float, num_features: int) -> float:
-    """Return the Euclidean norm up to which ``share_rows_below=threshold`` takes ``num_features`` features for zero."""
-    return threshold * math.sqrt(num_features)
 
 
 @dataclass(frozen=True)
@@ -187,8 +161,7 @@ def rendering_error(density_error: float, color_error: float, near: float, far: 
 def feature_noise_error(field: RadianceField, norm: float, near: float, far: float) -> RenderingError:
     """Bound what a ray changes when each sample's features change by at most ``norm`` (Euclidean).
 
-    For ``max_radius`` the norm is ``cut_norm(feature_error_bound(...), feature_dim)``, for ``share_rows_below`` it is
-    ``shared_norm(threshold, num_features)``; used together, the two norms add up.
+    For ``max_radius`` the norm is ``cut_norm(feature_error_bound(...), feature_dim)``.
     """
     slope = field_lipschitz(field)
     return rendering_error(slope.density * norm, slope.color * norm, near, far)

@@ -10,7 +10,6 @@ from torch import Tensor
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
-from vpd_lightning.renderer.early_stop import front_to_back
 from vpd_lightning.renderer.features.feature_network import FeatureNetwork
 from vpd_lightning.renderer.features.neighbor_features import NeighborFeatures
 from vpd_lightning.renderer.features.point_features import check_kernels
@@ -27,9 +26,7 @@ from vpd_lightning.renderer.rays.hierarchical_sampling import (
     interval_ends,
     points_along,
 )
-from vpd_lightning.renderer.rays.merged_samples import MergedSamples
 from vpd_lightning.renderer.rays.volumetric import ray_weights
-from vpd_lightning.renderer.row_sharing import SharedRows
 from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
 
@@ -56,12 +53,9 @@ class PointNeRFRenderer(AbstractRenderer):
     particles may change places), ``reuse_coarse`` (the fine tier does not compute the coarse samples' neighbours and
     features again), ``features_backend`` (see ``fused_features``).
 
-    Bounded, with the bounds in ``bounds``: ``early_stop`` (the transmittance below which the rest of a ray is left out
-    of the fine tier, looked at before each of ``num_stop_segments`` parts; the coarse tier stays whole, because the
-    places of the fine samples depend on all of its weights), ``max_radius`` (metres: farther particles are not seen),
-    ``share_rows_below`` (samples whose features are all at most this large share one row of their ray;
-    ``last_shared_rows`` says how many rows that saved). The bounds of the last two hold for given places of the
-    samples (``render_at``); that the coarse weights and with them the fine samples move too is measured, not bounded.
+    Bounded, with the bounds in ``bounds``: ``max_radius`` (metres: farther particles are not seen). The bound holds for
+    given places of the samples (``render_at``); that the coarse weights and with them the fine samples move too is
+    measured, not bounded.
     """
 
     def __init__(
@@ -89,9 +83,6 @@ class PointNeRFRenderer(AbstractRenderer):
         sort_particles: bool,
         reuse_coarse: bool,
         max_radius: float | None,
-        early_stop: float,
-        num_stop_segments: int,
-        share_rows_below: float | None,
         ray_chunk_size: int | None,
         checkpoint_chunks: bool,
     ) -> None:
@@ -102,17 +93,13 @@ class PointNeRFRenderer(AbstractRenderer):
         if num_coarse_samples < 3:
             raise ValueError(f"num_coarse_samples must be at least 3, got {num_coarse_samples}.")
         counts = {"feature_dim": feature_dim, "num_neighbors": num_neighbors, "num_fine_samples": num_fine_samples}
-        counts["num_stop_segments"] = num_stop_segments
         if ray_chunk_size is not None:
             counts["ray_chunk_size"] = ray_chunk_size
         for name, value in counts.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}.")
-        if not 0 <= early_stop < 1:
-            raise ValueError(f"early_stop must be a transmittance in [0, 1), 0 for off, got {early_stop}.")
-        for name, least in {"max_radius": max_radius, "share_rows_below": share_rows_below}.items():
-            if least is not None and not least >= 0:
-                raise ValueError(f"{name} must be at least 0, or null for off, got {least}.")
+        if max_radius is not None and not max_radius >= 0:
+            raise ValueError(f"max_radius must be at least 0, or null for off, got {max_radius}.")
         if neighbors_backend not in ("auto", *BACKENDS):
             raise ValueError(f"neighbors_backend must be auto or one of {BACKENDS}, got {neighbors_backend!r}.")
         if features_backend not in ("auto", *FEATURE_BACKENDS):
@@ -141,10 +128,6 @@ class PointNeRFRenderer(AbstractRenderer):
         self.sort_particles = sort_particles
         self.reuse_coarse = reuse_coarse
         self.max_radius = max_radius
-        self.early_stop = float(early_stop)
-        self.num_stop_segments = num_stop_segments
-        self.share_rows_below = share_rows_below
-        self._num_evaluated = self._num_shared = 0
         self.ray_chunk_size = ray_chunk_size
         self.checkpoint_chunks = checkpoint_chunks
 
@@ -180,7 +163,6 @@ class PointNeRFRenderer(AbstractRenderer):
         )
         batch_size, num_rays = rays.origins.shape[:2]
         features = self._sample_features(particles)
-        self._num_evaluated = self._num_shared = 0
         # All random numbers are drawn here, so that neither chunks nor recomputation change them.
         noise = quantiles = None
         if keys is not None:
@@ -204,7 +186,6 @@ class PointNeRFRenderer(AbstractRenderer):
     def render_at(self, particles: Particles, rays: Rays, t: Float[Tensor, "batch ray sample"]) -> RenderedRays:
         """Render with the fine tier alone at given ascending distances (metres); ``bounds`` speaks of this."""
         features = self._sample_features(particles)
-        self._num_evaluated = self._num_shared = 0
         origins, directions = at_least_float32(rays.origins), at_least_float32(rays.directions)
         return self._composited(*self._fine_tier(features, origins, directions, t), t)
 
@@ -249,28 +230,12 @@ class PointNeRFRenderer(AbstractRenderer):
         known: Float[Tensor, "batch ray known feature"] | None = None,
     ) -> tuple[Float[Tensor, "batch ray sample"], Float[Tensor, "batch ray sample 3"]]:
         """Return densities and colours at ``t``: of ``known`` features and new places, in the ``order`` of distance."""
-        if self.early_stop > 0:
-            samples = MergedSamples(features, points_along(origins, directions, t), order, known)
-            flat_directions = directions.flatten(0, 1)
-            sigmas, rgbs = front_to_back(
-                lambda rays, part: self._evaluate(self.fine, samples.features(rays, part), flat_directions[rays]),
-                t.flatten(0, 1),
-                interval_ends(t, self.far).flatten(0, 1),
-                self.early_stop,
-                self.num_stop_segments,
-            )
-            return sigmas.view(t.shape), rgbs.view(*t.shape, 3)
         if known is None or t_new is None or order is None:
             return self._evaluate(self.fine, features(points_along(origins, directions, t)), directions)
         new = features(points_along(origins, directions, t_new))
         sigmas, rgbs = self._evaluate(self.fine, (known, new), directions)
         # The network does not care about order, so only its four outputs are sorted, not the features.
         return sigmas.gather(-1, order), rgbs.gather(-2, order[..., None].expand(*order.shape, 3))
-
-    @property
-    def last_shared_rows(self) -> float | None:
-        """Share of the network's rows that ``share_rows_below`` saved in the last call; ``None`` where it is off."""
-        return self._num_shared / self._num_evaluated if self._num_evaluated else None
 
     def _composited(
         self,
@@ -291,20 +256,8 @@ class PointNeRFRenderer(AbstractRenderer):
         """Return what a network says of samples; several parts of ``features`` are joined along the samples."""
         parts = features if isinstance(features, tuple) else (features,)
 
-        def joined_parts(parts: tuple[Tensor, ...]) -> Tensor:
-            return torch.cat(parts, dim=-2) if len(parts) > 1 else parts[0]
-
-        shared = None
-        if self.share_rows_below is not None:
-            shared = SharedRows(joined_parts(parts), self.share_rows_below)
-            self._num_evaluated += shared.num_samples
-            self._num_shared += shared.num_saved
-
         def network(*parts: Tensor) -> tuple[Tensor, Tensor | None]:
-            joined_features = joined_parts(parts)
-            if shared is None:
-                return field(joined_features, directions, use_color)
-            return shared.evaluate(field, joined_features, directions, use_color)
+            return field(torch.cat(parts, dim=-2) if len(parts) > 1 else parts[0], directions, use_color)
 
         return recomputed(network, *parts, is_enabled=self.checkpoint_chunks)
 

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from vpd_lightning.geometry.decay import decay
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
-from vpd_lightning.renderer.kernels.ray_search import BesideAndBehind, RaySearch, check_backend
+from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend
+from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 
 _DARKEST = 0.01

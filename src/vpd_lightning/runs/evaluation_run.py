@@ -7,7 +7,6 @@ from typing import Any
 import torch
 import yaml
 
-from vpd_lightning.commands.eval import choose_protocol, set_threads
 from vpd_lightning.data.manifest import Manifest, file_sha256
 from vpd_lightning.errors import ConfigError, OutOfMemoryError
 from vpd_lightning.evaluation.evaluate import Evaluation, evaluate
@@ -24,6 +23,7 @@ from vpd_lightning.release.release_folder import is_release
 from vpd_lightning.release.results_folder import beside_checkpoint
 from vpd_lightning.runs.one_recording import data_set
 from vpd_lightning.runs.progress import show_progress
+from vpd_lightning.runs.threads import set_threads
 from vpd_lightning.training.checkpoint_files import load_checkpoint
 from vpd_lightning.training.module import DATA_SHA256
 
@@ -61,6 +61,20 @@ def run_evaluation(config: Mapping[str, Any]) -> Path:
     print()
     print(path)
     return path
+
+
+def choose_protocol(wanted: Mapping[str, Any], of_run: Mapping[str, Any] | None) -> Protocol:
+    """Return the protocol: what the run's configuration says, with the values that are set replacing its own.
+
+    Raises:
+        ConfigError: the run has no protocol (an old checkpoint) and none was chosen, or a value is out of range.
+    """
+    whole = all(value is not None for key, value in wanted.items() if key != "num_trajectories")
+    values = dict(wanted) if whole else {**(of_run or {}), **{k: v for k, v in wanted.items() if v is not None}}
+    missing = [key for key in wanted if key not in values]
+    if missing:
+        raise ConfigError(f"The run does not say how to evaluate it ({missing[0]} is missing).\nSet protocol=paper.")
+    return Protocol(**{key: values[key] for key in wanted})
 
 
 def _require_predictions(model: LoadedModel) -> None:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vpd_lightning.commands.eval import data_folder
 from vpd_lightning.data.manifest import Manifest, load_manifest
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.loading import LoadedModel, load_model
@@ -33,6 +32,14 @@ def data_set(folder: str | None, config: Mapping[str, Any]) -> Manifest:
     if folder is None and (config.get("generate") or {}).get("when_missing"):
         provide_data(config)
     return load_manifest(data_folder(folder, config))
+
+
+def data_folder(wanted: str | None, config: Mapping[str, Any]) -> Path:
+    """Return the data set to use: the one asked for, or the one that the model was trained on."""
+    folder = wanted or config.get("data", {}).get("folder")
+    if not isinstance(folder, str):
+        raise ConfigError("The checkpoint does not say what data it was trained on.\nGive data.folder=FOLDER.")
+    return Path(folder)
 
 
 def choose_trajectory(manifest: Manifest, split: str, number: int) -> Path:

@@ -1,6 +1,6 @@
 """The tab that selects and edits."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -8,9 +8,7 @@ from vpd_lightning.editing.edit_files import load_edit
 from vpd_lightning.editing.operations import Delete, Duplicate, Move, Scale, SetVelocity
 from vpd_lightning.editing.selectors import Cluster, Color, Everything, Lasso, Selector
 from vpd_lightning.viewer.session import COMBINATIONS
-
-if TYPE_CHECKING:
-    from vpd_lightning.viewer.panel import Panel
+from vpd_lightning.viewer.tab_host import TabHost
 
 _BESIDE = 0.3  # of the workspace's width: where a copy appears
 
@@ -18,7 +16,7 @@ _BESIDE = 0.3  # of the workspace's width: where a copy appears
 class EditTab:
     """Selection by cluster, rectangle and colour; a gizmo that moves what is selected; edits, undo and comparison."""
 
-    def __init__(self, panel: "Panel"):
+    def __init__(self, panel: TabHost):
         self.panel, self.session = panel, panel.session
         gui: Any = panel.client.gui
         self.status = gui.add_markdown("")

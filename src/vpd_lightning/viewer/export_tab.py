@@ -1,6 +1,6 @@
 """The tab that writes files."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,9 +11,7 @@ from vpd_lightning.types import Cameras
 from vpd_lightning.viewer.exports import PARTICLE_FORMATS
 from vpd_lightning.viewer.progressive_view import Viewpoint
 from vpd_lightning.viewer.session import to_uint8
-
-if TYPE_CHECKING:
-    from vpd_lightning.viewer.panel import Panel
+from vpd_lightning.viewer.tab_host import TabHost
 
 _PATH_FPS = 10.0
 
@@ -21,7 +19,7 @@ _PATH_FPS = 10.0
 class ExportTab:
     """Particles of the step shown, a film of the rollout from the browser's camera, a camera path, the edits."""
 
-    def __init__(self, panel: "Panel"):
+    def __init__(self, panel: TabHost):
         self.panel = panel
         self._places: list[Viewpoint] = []
         gui: Any = panel.client.gui

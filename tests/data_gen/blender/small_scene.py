@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from data_gen.blender.process import find_python
 from data_gen.cameras import camera_xml
-from data_gen.renderers import Labels
+from data_gen.labels import Labels
 from data_gen.scene_settings import CameraSettings
 from vpd_lightning.errors import ConfigError
 

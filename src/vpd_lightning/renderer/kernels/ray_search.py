@@ -16,42 +16,13 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vpd_lightning.renderer.field.precision import at_least_float32, full_precision
+from vpd_lightning.renderer.rays.ray_scores import BesideRay, RayScore
 from vpd_lightning.types import is_traced, require_finite
 
 CANDIDATE_BACKENDS = ("auto", "torch", "numba")
 
 _PAIRS_PER_CHUNK = {"cpu": 1 << 18, "cuda": 1 << 26}
 """Scores at a time: 1 MB of float32 stays in cache; a GPU wants much to do at once."""
-
-
-@dataclass(frozen=True)
-class BesideRay:
-    """Score by the squared distance beside the ray; particles outside [near, far] along the ray are left out."""
-
-    near: float
-    far: float
-
-
-@dataclass(frozen=True)
-class BesideAndBehind:
-    """Score by the squared distance beside the ray, and by how far behind the first surface.
-
-    ``beside^2 + 0.04 max(0, along - first - depth)^2``, where ``first`` is the smallest ``along`` of all particles
-    within ``width`` of the ray (of those farther away, ``500 / width max(0, beside^2 - width^2)`` is added). What is
-    closer than ``near``, or behind the camera, is left out. Nothing in it knows how long a metre is.
-    """
-
-    near: float
-    width: float
-    depth: float
-
-    @property
-    def steepness(self) -> float:
-        """What a square metre beyond ``width`` counts, in metres."""
-        return 500 / self.width
-
-
-RayScore = BesideRay | BesideAndBehind
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vpd_lightning.graph.ordering import build_blocks, morton_order
-from vpd_lightning.renderer.kernels.ray_search import BesideRay, RayScore
+from vpd_lightning.renderer.rays.ray_scores import BesideRay, RayScore
 from vpd_lightning.threads import in_threads
 
 _BLOCK = 16

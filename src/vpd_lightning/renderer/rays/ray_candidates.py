@@ -10,7 +10,8 @@ from torch import Tensor
 from vpd_lightning.renderer.features.neighbor_features import NeighborFeatures
 from vpd_lightning.renderer.features.point_features import kernel_weights, safe_norm
 from vpd_lightning.renderer.field.precision import at_least_float32, full_precision
-from vpd_lightning.renderer.kernels.ray_search import BesideRay, Candidates, RaySearch, resolved_backend
+from vpd_lightning.renderer.kernels.ray_search import Candidates, RaySearch, resolved_backend
+from vpd_lightning.renderer.rays.ray_scores import BesideRay
 from vpd_lightning.types import Particles, Rays
 
 

@@ -1,0 +1,14 @@
+"""What a segmentation says."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the segmentation says where a MuJoCo object is seen: 0 background, i + 1 object i."""
+
+    geoms: NDArray[np.uint8]  # (model.ngeom,)
+    flexes: NDArray[np.uint8]  # (model.nflex,)
