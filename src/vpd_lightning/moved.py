@@ -85,7 +85,6 @@ MOVED: dict[str, str] = {
     "vpd_lightning.renderer.fused_features_triton": "vpd_lightning.renderer.kernels.fused_features_triton",
     "vpd_lightning.renderer.fused_loops_numba": "vpd_lightning.renderer.kernels.fused_loops_numba",
     "vpd_lightning.renderer.fused_loops_triton": "vpd_lightning.renderer.kernels.fused_loops_triton",
-    "vpd_lightning.renderer.merged_samples": "vpd_lightning.renderer.rays.merged_samples",
     "vpd_lightning.renderer.neighbor_features": "vpd_lightning.renderer.features.neighbor_features",
     "vpd_lightning.renderer.particle_search": "vpd_lightning.renderer.rays.particle_search",
     "vpd_lightning.renderer.point_features": "vpd_lightning.renderer.features.point_features",
