@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.cpu_seconds import pytest_addoption, pytest_configure  # noqa: F401
+
 # Tests run in several processes; more threads than cores makes all of them slower. Set before OpenCV or HDF5 load.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 torch.set_num_threads(1)

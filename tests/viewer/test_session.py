@@ -1,8 +1,10 @@
 """What the viewer does, without a browser."""
 
+import itertools
 import threading
-import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +23,8 @@ from vpd_lightning.editing.operations import Delete, Duplicate, Move
 from vpd_lightning.editing.selectors import Box, Everything
 from vpd_lightning.errors import EditError
 from vpd_lightning.media.camera_paths import read_camera_file
+from vpd_lightning.renderer.base import AbstractRenderer
+from vpd_lightning.viewer import progressive_view
 from vpd_lightning.viewer.exports import ExportFolder
 from vpd_lightning.viewer.opened_scene import OpenedScene
 from vpd_lightning.viewer.progressive_view import ProgressiveView, Request, Viewpoint
@@ -110,11 +114,18 @@ class Shown:
     def __init__(self) -> None:
         self.pictures: list[tuple[np.ndarray, bool]] = []
         self.event = threading.Event()
+        self.changed = threading.Condition()
 
     def __call__(self, image: np.ndarray, is_full: bool) -> None:
-        self.pictures.append((image, is_full))
+        with self.changed:
+            self.pictures.append((image, is_full))
+            self.changed.notify_all()
         if is_full:
             self.event.set()
+
+    def wait_for(self, number: int) -> None:
+        with self.changed:
+            assert self.changed.wait_for(lambda: len(self.pictures) >= number, timeout=60)
 
 
 def viewpoint(opened: OpenedScene, aspect: float = 1.0) -> Viewpoint:
@@ -137,21 +148,71 @@ def test_a_coarse_picture_comes_first_and_the_full_one_is_that_of_the_simulator(
     assert np.abs(full.astype(int) - (whole * 255).round().numpy().astype(int)).max() <= 1  # bands: other sums
 
 
-def test_what_is_out_of_date_is_not_finished(opened: OpenedScene) -> None:
+class HeldRenderer:
+    """A renderer that tells when a drawing begins, and draws when it is let."""
+
+    def __init__(self, renderer: AbstractRenderer) -> None:
+        self.renderer = renderer
+        self.begun, self.let = threading.Semaphore(0), threading.Semaphore(0)
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.begun.release()
+        assert self.let.acquire(timeout=60)
+        return self.renderer(*arguments)
+
+    def wait(self) -> None:
+        """Wait until it has begun to draw."""
+        assert self.begun.acquire(timeout=60)
+
+    def draw(self) -> None:
+        """Let it draw once."""
+        self.let.release()
+
+
+def test_what_is_out_of_date_is_not_finished(opened: OpenedScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    ticks = itertools.count(
+        step=100
+    )  # each drawing takes 100 s by this clock: coarse pictures stay small, bands one row high
+    monkeypatch.setattr(progressive_view, "time", SimpleNamespace(perf_counter=lambda: float(next(ticks))))
+    monkeypatch.setattr(progressive_view, "STILL_SECONDS", 0.0)
     shown, state = Shown(), opened.scene.current
+    held = HeldRenderer(opened.simulator.renderer)
     view = ProgressiveView(opened.simulator.renderer, shown)
-    view._pixels_per_second = 1.0
+    view._renderer, view._pixels_per_second = held, 1.0
+    old = Request([state], viewpoint(opened), 64)
     try:
-        for _ in range(5):
-            view.ask(Request([state], viewpoint(opened), 64))
-            time.sleep(0.02)
+        view.ask(old)
+        held.wait()
+        view.ask(old)  # while the coarse picture of the first is drawn
+        held.draw()
+        held.wait()
+        held.draw()  # the coarse picture of the second
+        held.wait()
+        held.draw()  # its first band
+        held.wait()
+        assert [image.shape for image, _ in shown.pictures] == [(24, 24, 3)] * 2
+        monkeypatch.setattr(progressive_view, "STILL_SECONDS", 600.0)
+        view.ask(old)  # while its second band is drawn
+        held.draw()
+        held.wait()
+        held.draw()  # the coarse picture of the third, which then waits until the camera is still
+        shown.wait_for(3)
         view.ask(Request([state, state], viewpoint(opened), 32))  # two scenes side by side
+        held.wait()
+        monkeypatch.setattr(progressive_view, "STILL_SECONDS", 0.0)
+        held.draw()
+        for _ in range(1 + 2 * 32):
+            held.wait()
+            held.draw()
         assert shown.event.wait(60)
     finally:
+        held.let.release(1000)
         view.stop()
+    assert [image.shape[0] for image, is_full in shown.pictures if not is_full] == [24] * 4
     full = [image for image, is_full in shown.pictures if is_full]
     assert [image.shape for image in full] == [(32, 32, 3)]
     assert np.array_equal(full[0][:, :16], full[0][:, 16:])
+    assert not held.begun.acquire(blocking=False)  # no drawing but those counted
 
 
 def test_exports_are_read_again_identically(opened: OpenedScene, tmp_path: Path) -> None:

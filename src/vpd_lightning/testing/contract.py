@@ -98,6 +98,19 @@ def assert_same(actual: Any, expected: Any, tolerance: float = 0.0) -> None:
         )
 
 
+@contextmanager
+def said(what: str) -> Iterator[None]:
+    """Say in which case a check fails.
+
+    Raises:
+        AssertionError: of the check, with the case before its text.
+    """
+    try:
+        yield
+    except AssertionError as error:
+        raise AssertionError(f"{what}: {error}") from error
+
+
 def assert_finite(value: Any, what: str) -> None:
     """Check all floating tensors of a result.
 

@@ -14,6 +14,7 @@ from vpd_lightning.testing.contract import (
     assert_same,
     global_randomness_untouched,
     may_depart,
+    said,
     tensors_of,
     unchanged,
 )
@@ -74,6 +75,15 @@ class LossContract(Contract):
         output = self.output(batch)
         alone = [loss(_member_output(output, index), _member_batch(batch, index)) for index in range(3)]
         assert_same(loss(output, batch), torch.stack(alone).mean(), self.tolerance)
+
+    def test_padding_changes_nothing(self) -> None:
+        loss, batch = self.built(), self.batch()
+        output = self.output(batch)
+        plain = loss(output, batch)
+        for where, padded in sets.PADDINGS.items():
+            with said(f"with padding {where}"):
+                wide = replace(output, states=[padded(state) for state in output.states])
+                assert_same(loss(wide, batch), plain, self.tolerance)
 
     def test_repeats_and_leaves_inputs_and_global_randomness_alone(self) -> None:
         loss, batch = self.built().train(), self.batch()

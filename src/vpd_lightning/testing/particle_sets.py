@@ -50,7 +50,7 @@ def only_valid(particles: Particles, count: int) -> Particles:
     return replace(particles, mask=mask)
 
 
-def padded(particles: Particles) -> Particles:
+def padded_far(particles: Particles) -> Particles:
     """Return the particles with padding before and behind them that holds large finite numbers."""
 
     def with_padding(values: Tensor) -> Tensor:
@@ -58,7 +58,30 @@ def padded(particles: Particles) -> Particles:
         junk = torch.full(shape, 40.0 if values.is_floating_point() else True, dtype=values.dtype, device=values.device)
         return torch.cat([junk, values, junk], dim=1)
 
-    wide = mapped(particles, with_padding)
+    return _with_padding_masked(mapped(particles, with_padding))
+
+
+def padded_inside(particles: Particles) -> Particles:
+    """Return the particles with padding that lies among them: neighbours of all, were it not for the mask."""
+    moved = replace(
+        particles,
+        positions=particles.positions + 0.02,
+        features=1.0 - particles.features,
+        moving=None if particles.moving is None else torch.ones_like(particles.moving),
+    )
+    parts = [first(moved, _NUM_PADDING), particles, mapped(moved, lambda values: values[:, -_NUM_PADDING:])]
+
+    def joined(name: str) -> Tensor | None:
+        values = [getattr(part, name) for part in parts]
+        return None if values[0] is None else torch.cat(values, dim=1)
+
+    return _with_padding_masked(Particles(**{item.name: joined(item.name) for item in fields(Particles)}))
+
+
+PADDINGS = {"far away": padded_far, "among the particles": padded_inside}
+
+
+def _with_padding_masked(wide: Particles) -> Particles:
     mask = wide.mask.clone()
     mask[:, :_NUM_PADDING] = False
     mask[:, -_NUM_PADDING:] = False
@@ -66,5 +89,5 @@ def padded(particles: Particles) -> Particles:
 
 
 def without_padding(particles: Particles) -> Particles:
-    """Return the slots that ``padded`` did not add."""
+    """Return the slots that padding did not add."""
     return mapped(particles, lambda values: values[:, _NUM_PADDING:-_NUM_PADDING])

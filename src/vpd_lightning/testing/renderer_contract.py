@@ -16,6 +16,7 @@ from vpd_lightning.testing.contract import (
     disturb_global_randomness,
     global_randomness_untouched,
     may_depart,
+    said,
     summed,
     unchanged,
 )
@@ -76,7 +77,9 @@ class RendererContract(Contract):
         renderer, particles, rays = self.built(), self.particles(), self.rays()
         for keys in (None, keys_for(2)):
             plain = renderer(particles, rays, keys)
-            assert_same(renderer(sets.padded(particles), rays, keys), plain, self.tolerance)
+            for where, padded in sets.PADDINGS.items():
+                with said(f"with padding {where}"):
+                    assert_same(renderer(padded(particles), rays, keys), plain, self.tolerance)
 
     @may_depart
     def test_order_of_particles_does_not_matter(self) -> None:

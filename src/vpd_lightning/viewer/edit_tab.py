@@ -49,6 +49,7 @@ class EditTab:
         self.rectangle.on_update(lambda _: panel.act(self._arm_rectangle))
         self._gizmo: Any = None
         self._preview: Any = None
+        self._armed = False
         self.refresh()
 
     def _button(self, label: str, action: Any) -> None:
@@ -61,7 +62,8 @@ class EditTab:
         if self.clusters.options != options:
             self.clusters.options = options
         count = int(self.session.selected.sum())
-        self.status.content = f"**{count}** particles selected, {len(self.session.operations())} edits"
+        text = f"**{count}** particles selected, {len(self.session.operations())} edits"
+        self.status.content = text + ("  \nDrag a rectangle around what to select." if self._armed else "")
         self._place_gizmo()
 
     def _select(self, selector: Selector | None) -> None:
@@ -79,13 +81,15 @@ class EditTab:
 
     def _arm_rectangle(self) -> None:
         scene = self.panel.client.scene
-        if not self.rectangle.value:
-            scene.remove_rect_select_callback()
-            return
+        scene.remove_rect_select_callback()
+        self._armed = bool(self.rectangle.value)
+        if self._armed:
 
-        @scene.on_rect_select()
-        def _(event: Any) -> None:
-            self.panel.act(lambda: self._select(self.rectangle_selector(event.screen_min, event.screen_max)))
+            @scene.on_rect_select()
+            def _(event: Any) -> None:
+                self.panel.act(lambda: self._select(self.rectangle_selector(event.screen_min, event.screen_max)))
+
+        self.refresh()  # the hint reaches the browser after the callback: whoever sees it can drag
 
     def rectangle_selector(self, low: tuple[float, float], high: tuple[float, float]) -> Selector:
         """Return what the browser's camera sees in a rectangle of the screen (shares of its width and height)."""

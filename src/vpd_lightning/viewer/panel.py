@@ -156,7 +156,7 @@ class Panel:
 
     def _play(self) -> None:
         while not self._closed.is_set():
-            if not self._playing.wait(timeout=0.5):
+            if not self._playing.wait(timeout=0.5) or self._closed.is_set():
                 continue
             last = int(self.step.max)
             self.step.value = 0 if int(self.step.value) >= last else int(self.step.value) + 1
