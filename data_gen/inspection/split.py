@@ -121,12 +121,16 @@ def share(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
 
 
 def _recordings(manifest: Manifest) -> dict[str, list[Path]]:
-    """Return the files of each recording; a file that names none is one by itself."""
+    """Return the files of each recording; one that names none is a recording by itself, together with its copies."""
     found: dict[str, list[Path]] = {}
+    first: dict[str, str] = {}  # of the files with the same bytes, the name that sorts first
+    for name, checksum in sorted(manifest.sha256.items()):
+        first.setdefault(checksum, name)
     for path in (path for files in manifest.splits.values() for path in files):
         with open_file(path) as file:
             named = RECORDING in file.attrs
-            name = checked_attribute(path, file, RECORDING, "text") if named else manifest.relative(path)
+            checksum = manifest.sha256[manifest.relative(path)]
+            name = checked_attribute(path, file, RECORDING, "text") if named else first[checksum]
         found.setdefault(f"{int(named)} {name}", []).append(path)
     if not found:
         raise DataError(f"{manifest.folder} holds no trajectory to divide.")

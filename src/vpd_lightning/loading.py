@@ -11,6 +11,7 @@ from vpd_lightning.errors import CheckpointError, ConfigError
 from vpd_lightning.release.release_folder import is_release, read_release
 
 _PREFIX = "simulator."
+_LARGE = ("state_dict", "optimizer_states", "lr_schedulers")
 
 
 @dataclass(frozen=True)
@@ -18,13 +19,18 @@ class LoadedModel:
     """A trained system in evaluation mode, the plain configuration it was built from, and the file it came from.
 
     ``simulator`` is a ``Simulator`` where the system is made of encoder, dynamics and renderer, and else another kind
-    of ``AbstractSystem``: which one, only the file knows.
+    of ``AbstractSystem``: which one, only the file knows. ``sha256`` is that of the file. ``trained_on`` holds the
+    SHA-256 of each trajectory that a training of these weights saw (None: the file does not say), ``checkpoint`` what a
+    checkpoint says beside its weights and the state of the optimiser (None: a released model).
     """
 
     simulator: Any
     config: dict[str, Any]
     path: Path
     step: int
+    sha256: str
+    trained_on: frozenset[str] | None
+    checkpoint: Mapping[str, Any] | None
 
     @property
     def input_views(self) -> list[int]:
@@ -112,7 +118,9 @@ def load_model(
                 f"change={dict(change)} asks for other weights than {path} holds.\n{detail[:300]}"
             ) from error
         raise CheckpointError(f"The weights in {path} do not fit the model it describes.\n{detail[:300]}") from error
-    return LoadedModel(simulator.to(target).eval(), config, path, stored.step)
+    return LoadedModel(
+        simulator.to(target).eval(), config, path, stored.step, stored.sha256, stored.trained_on, stored.checkpoint
+    )
 
 
 @dataclass(frozen=True)
@@ -123,22 +131,38 @@ class _Stored:
     weights: Mapping[str, torch.Tensor]
     config: Any
     step: int
+    sha256: str
+    trained_on: frozenset[str] | None
+    checkpoint: Mapping[str, Any] | None
 
 
 def _read(path: Path) -> _Stored:
-    from vpd_lightning.training.checkpoint_files import load_checkpoint
-    from vpd_lightning.training.checkpoints import find_resume
+    from vpd_lightning.data.manifest import TRAINED_ON
+    from vpd_lightning.training.checkpoint_files import open_checkpoint
+    from vpd_lightning.training.checkpoints import open_resume
 
     if is_release(path):
         released = read_release(path)
-        return _Stored(released.path, released.weights, released.config, released.step)
-    if path.is_dir():
-        path = find_resume(path)
-    content = load_checkpoint(path)
+        return _Stored(
+            released.path, released.weights, released.config, released.step,
+            sha256=released.sha256, trained_on=_checksums(released.trained_on), checkpoint=None,
+        )  # fmt: skip
+    opened = open_resume(path) if path.is_dir() else open_checkpoint(path)
+    content = opened.content
     step = content.get("global_step", 0)
     return _Stored(
-        path, simulator_weights(content), content.get("hyper_parameters"), step if isinstance(step, int) else 0
+        path=opened.path,
+        weights=simulator_weights(content),
+        config=content.get("hyper_parameters"),
+        step=step if isinstance(step, int) else 0,
+        sha256=opened.sha256,
+        trained_on=_checksums(content.get(TRAINED_ON)),
+        checkpoint={name: value for name, value in content.items() if name not in _LARGE},
     )
+
+
+def _checksums(stored: Any) -> frozenset[str] | None:
+    return frozenset(map(str, stored)) if isinstance(stored, list) else None
 
 
 def simulator_weights(content: Mapping[str, Any]) -> dict[str, torch.Tensor]:

@@ -9,14 +9,20 @@ import shutil
 import socket
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import h5py
 import pytest
 import torch
 
+from data_gen.inspection.fault import Fault
+from data_gen.inspection.split import split_dataset
 from tests.data.recordings import write_recordings
 from vpd_lightning.commands import data, eval, export, info, render, report, train, view
+from vpd_lightning.data import busy
+from vpd_lightning.data.manifest import load_manifest, write_manifest
+from vpd_lightning.data.verdict import keep_verdict
 from vpd_lightning.runs import run_claim
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "errors.md"
@@ -89,7 +95,30 @@ def _lightning_checkpoint(patch: pytest.MonkeyPatch) -> None:
     torch.save({"state_dict": {}, "pytorch-lightning_version": "1.0"}, "other.ckpt")
 
 
+def _not_validated(patch: pytest.MonkeyPatch) -> None:
+    shutil.copytree("datasets/tiny", "datasets/table")
+    manifest = load_manifest("datasets/table")
+    write_manifest(replace(manifest, generator="vpd-data import, format plain"))
+
+
+def _failed_validation(patch: pytest.MonkeyPatch) -> None:
+    keep_verdict(load_manifest("datasets/table"), [Fault("views_disagree", "train/000003.h5", _DISAGREE)])
+
+
+def _busy_file(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(busy, "_programs", lambda path, writing: ["jupyter-lab (process 4711)"])
+    shutil.copytree("datasets/tiny", "datasets/busy")
+    _OPEN.append(h5py.File("datasets/busy/train/000000.h5"))
+
+
+def _divided_anew(patch: pytest.MonkeyPatch) -> None:
+    shutil.copytree("datasets/tiny", "datasets/divided")
+    split_dataset("datasets/divided", validation=2, test=4, seed=1)
+
+
 QUICK = "QUICK"
+_OPEN: list[h5py.File] = []
+_DISAGREE = "points seen twice are 4 % of their depth apart (median); it would be 0.1 % if depth is a distance"
 MISTAKES = [
     Mistake("A key that is spelt wrong", "vpd-train experiment=tiny encoder.num_particle=64", 2),
     Mistake("A key in another section", "vpd-train experiment=tiny trainer.batch_size=4", 2),
@@ -105,6 +134,16 @@ MISTAKES = [
     Mistake("Data that were not generated yet", "vpd-train experiment=mujoco_block trainer=cpu", 3),
     Mistake("A data folder that is not there", "vpd-train data.folder=mine trainer=cpu", 3),
     Mistake("A data file that was cut short", "vpd-train data.folder=datasets/cut", 3, QUICK, _cut_data),
+    Mistake(
+        "A data folder that is spelt wrong", "vpd-train experiment=tiny data.folder=datasets/tinny", 3, QUICK,
+    ),
+    Mistake(
+        "Recordings that were never validated", "vpd-train data.folder=datasets/table", 3, QUICK, _not_validated,
+    ),
+    Mistake(
+        "Recordings that failed validation", "vpd-train data.folder=datasets/table", 3, QUICK, _failed_validation,
+    ),
+    Mistake("A data file that another program holds", "vpd-train data.folder=datasets/busy", 3, QUICK, _busy_file),
     Mistake("A camera that is not there", "vpd-train experiment=tiny scene.input_views=[0,7]", 3, QUICK),
     Mistake("Clips longer than the recordings", "vpd-train experiment=tiny data.num_steps=40", 3, QUICK),
     Mistake(
@@ -122,6 +161,10 @@ MISTAKES = [
     Mistake("A checkpoint that is damaged", "vpd-eval ckpt=damaged.ckpt", 4, "", _damaged),
     Mistake("A checkpoint of another program", "vpd-eval ckpt=other.ckpt", 4, "", _lightning_checkpoint),
     Mistake("A split that does not exist", "vpd-eval ckpt=runs/trained protocol.split=testing", 2),
+    Mistake(
+        "Trajectories that were trained on",
+        "vpd-eval ckpt=runs/trained data.folder=datasets/divided", 3, before=_divided_anew,
+    ),
     Mistake("More steps than were recorded", "vpd-eval ckpt=runs/trained protocol.num_steps=50", 3),
     Mistake("A device that is not there", "vpd-eval ckpt=runs/trained device=cuda:77", 2),
     Mistake("A film into a folder that is there", "vpd-render ckpt=runs/trained out=runs", 2),

@@ -1,12 +1,15 @@
 """``vpd-eval`` from its words to its files, and what it refuses."""
 
+import hashlib
 import json
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 
 import vpd_lightning
@@ -205,3 +208,41 @@ def test_a_whole_protocol_takes_nothing_from_the_run() -> None:
 def test_a_run_without_protocol_needs_one() -> None:
     with pytest.raises(ConfigError, match="protocol=paper"):
         choose_protocol(dict.fromkeys(PROTOCOL), None)
+
+
+class Opened:
+    """Counts how often a file is opened, by whatever means: Python tells its audit hooks, which stay for good."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.count = str(path), 0
+        sys.addaudithook(self._hear)
+
+    def _hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if event == "open" and str(arguments[0]) == self.path:
+            self.count += 1
+
+
+@pytest.mark.parametrize("is_folder", [False, True])
+def test_a_checkpoint_is_read_and_checked_and_hashed_once(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch, is_folder: bool
+) -> None:
+    """Of a run folder, too, where the newest whole checkpoint is looked for first."""
+    size, loaded, hashed = checkpoint.stat().st_size, [], []
+    load, sha256 = torch.load, hashlib.sha256
+
+    def counted_load(*words: Any, **options: Any) -> Any:
+        loaded.append(words)
+        return load(*words, **options)
+
+    def counted_sha256(content: Any = b"", **options: Any) -> Any:
+        hashed.extend([len(content)] if len(content) > size // 2 else [])
+        return sha256(content, **options)
+
+    monkeypatch.setattr(torch, "load", counted_load)
+    monkeypatch.setattr(hashlib, "sha256", counted_sha256)
+    opened = Opened(checkpoint)
+    place = checkpoint.parents[1] if is_folder else checkpoint
+    assert main([f"ckpt={place}", "num_videos=0", "protocol.num_trajectories=1", "protocol.num_long_steps=0"]) == 0
+    assert (opened.count, len(loaded)) == (1, 1) and len(hashed) <= 1
+    metrics = json.loads((checkpoint.parents[1] / "evaluation" / "metrics.json").read_text())
+    assert metrics["checkpoint_sha256"] == sha256(checkpoint.read_bytes()).hexdigest()

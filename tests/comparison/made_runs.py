@@ -67,6 +67,7 @@ def write_run(
     metrics = {
         "format_version": 1, "model": experiment, "system": system, "experiment": experiment, "seed": seed,
         "checkpoint_sha256": "c" * 64, "step": 500, "data": str(folder / "no_data"), "data_sha256": data_sha256,
+        "seen_in_training": {"trajectories": 0, "of": NUM_TRAJECTORIES},
         "num_parameters": 12345, "finite": True, **content["model"],
         "protocol": {
             "split": "test", "start_frames": [4], "num_steps": NUM_STEPS, "num_views": NUM_VIEWS, "input_views": [0],

@@ -106,6 +106,16 @@ def test_same_budgets_warn_of_nothing(make_run: MakeRun, tmp_path: Path):
     assert board_warnings(boards(tmp_path)[0]) == []
 
 
+def test_what_was_trained_on_is_marked_and_so_is_what_nobody_knows(make_run: MakeRun, tmp_path: Path):
+    new, seen, old = make_run("new"), make_run("seen", system="global"), make_run("old", system="inertial")
+    change_json(seen / "evaluation" / "metrics.json", seen_in_training={"trajectories": 2, "of": 3})
+    change_json(old / "evaluation" / "metrics.json", seen_in_training=None)
+
+    trained, unknown = (line for line in board_warnings(boards(tmp_path)[0]) if "trained on what" in line)
+    assert f"{seen} (2 trajectories)" in trained and str(old) in unknown and "not known" in unknown
+    assert str(new) not in trained + unknown
+
+
 def test_all_trajectories_are_as_many_as_there_are(make_run: MakeRun, tmp_path: Path):
     make_run("gone", num_trajectories=None)
     data = make_run("there", num_trajectories=None, seed=1) / "no_data"

@@ -1,12 +1,14 @@
+import hashlib
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.data.recordings import write_recordings
-from vpd_lightning.data.manifest import load_manifest
+from vpd_lightning.data.manifest import did_you_mean, load_manifest
 from vpd_lightning.errors import DataError
 
 
@@ -103,3 +105,30 @@ def test_text_that_is_no_manifest_is_refused(folder: Path, text: str):
 
     with pytest.raises(DataError, match=r"dataset\.json"):
         load_manifest(folder)
+
+
+def test_a_set_that_was_never_divided_anew_keeps_the_digest_of_earlier_versions(folder: Path):
+    manifest = load_manifest(folder)
+    lines = "".join(f"{name} {value}\n" for name, value in sorted(manifest.sha256.items()))
+    assert manifest.digest == manifest.files_digest == hashlib.sha256(lines.encode()).hexdigest()
+
+
+def test_the_digest_changes_with_the_splits(folder: Path):
+    before = load_manifest(folder)
+    moved = {"train": before.splits["train"][1:], "validation": before.splits["validation"]}
+    seen = {before.digest}
+    for split in ("validation", "test"):
+        other = replace(before, splits={**moved, split: [*moved.get(split, []), before.splits["train"][0]]})
+        assert other.files_digest == before.files_digest
+        seen.add(other.digest)
+    assert len(seen) == 3
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [("sets/squars", "sets/squares"), ("set/squares", "sets/squares"), ("sets/something_else", None)],
+)
+def test_a_mistyped_folder_names_its_neighbours(tmp_path: Path, given: str, meant: str | None):
+    write_recordings(tmp_path / "sets" / "squares", num_train=1, num_validation=1)
+    line = did_you_mean(tmp_path / given)
+    assert line == (f"\nDid you mean {tmp_path / meant}?" if meant else "")

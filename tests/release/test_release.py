@@ -1,8 +1,10 @@
 """Released models: the same weights and predictions, nothing of the machine they come from, and damage is noticed."""
 
+import hashlib
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from torch import nn
 import vpd_lightning
 from tests.released_model import cameras, figures, predict, synthetic_frames, write_run, write_slotformer
 from vpd_lightning.errors import CheckpointError, ConfigError
-from vpd_lightning.loading import load_model
+from vpd_lightning.loading import LoadedModel, load_model
 from vpd_lightning.release.card_figures import beaten_by, beaten_in_motion_by, figure_lines
 from vpd_lightning.release.model_card import protocol_words
 from vpd_lightning.release.portable import absolute_paths, portable_config, portable_data_folder
@@ -32,10 +34,17 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_run(folder / "runs" / "first", folder / "datasets" / "boxes")
 
 
+def trained_system(model: LoadedModel) -> TrainedSystem:
+    return TrainedSystem(
+        system=model.simulator, config=model.config, checkpoint=model.path, step=model.step,
+        sha256=model.sha256, trained_on=model.trained_on,
+    )  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def trained(checkpoint: Path) -> TrainedSystem:
     model = load_model(checkpoint)
-    return TrainedSystem(system=model.simulator, config=model.config, checkpoint=model.path, step=model.step)
+    return trained_system(model)
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +239,7 @@ def test_figures_of_another_checkpoint_are_refused(trained: TrainedSystem, check
     shutil.copytree(checkpoint.parents[1], run)
     other = run / "checkpoints" / "best.ckpt"
     other.write_bytes(b"other bytes")
-    changed = TrainedSystem(system=trained.system, config=trained.config, checkpoint=other, step=3)
+    changed = replace(trained, checkpoint=other, step=3, sha256=hashlib.sha256(b"other bytes").hexdigest())
     with pytest.raises(ConfigError, match="figures of another checkpoint"):
         find_metrics(changed, None)
 
@@ -335,7 +344,7 @@ def test_paths_outside_of_what_is_built_go(in_folder: Path) -> None:
 
 def test_a_system_without_particles_is_released_alike(tmp_path: Path) -> None:
     model = load_model(write_slotformer(tmp_path / "run"))
-    trained = TrainedSystem(system=model.simulator, config=model.config, checkpoint=model.path, step=model.step)
+    trained = trained_system(model)
     metrics = {**figures(model.path, tmp_path), "chamfer": None, "motion": None}
     folder = tmp_path / "slots"
     folder.mkdir()

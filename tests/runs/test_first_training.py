@@ -13,6 +13,7 @@ import yaml
 from vpd_lightning.commands.train import main
 from vpd_lightning.config import compose, pretraining_config
 from vpd_lightning.config.pretraining import FOLDER
+from vpd_lightning.data.manifest import TRAINED_ON
 from vpd_lightning.errors import CheckpointError
 from vpd_lightning.loading import load
 from vpd_lightning.runs.first_training import DONE_FILE, load_pretrained
@@ -85,8 +86,11 @@ def test_second_training_starts_from_the_first_and_keeps_what_is_frozen(data: Pa
 
     # An auto-encoder that is there already can be given.
     other = tmp_path / "other"
-    assert train(data, other, f"pretraining.ckpt={run / FOLDER}") == 0
+    assert train(data, other, f"pretraining.ckpt={run / FOLDER}", "data.num_trajectories=1") == 0
     assert not (other / FOLDER).exists()
+    trained_on = load_checkpoint(other / "checkpoints" / "last.ckpt")[TRAINED_ON]
+    assert len(trained_on) > 1, "what the first training saw counts"
+    assert trained_on == load_checkpoint(run / FOLDER / "checkpoints" / "last.ckpt")[TRAINED_ON]
     given = load_checkpoint(other / "checkpoints" / "last.ckpt")["state_dict"]
     assert all(torch.equal(given[name], value) for name, value in first.items())
 

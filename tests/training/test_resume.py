@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,12 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from data_gen.inspection.split import split_dataset
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import SignalAt, tiny_data, tiny_module, tiny_trainer
-from vpd_lightning.data.manifest import load_manifest
-from vpd_lightning.training.checkpoint_files import load_checkpoint
+from vpd_lightning.data.manifest import DATA_SHA256, TRAINED_ON, load_manifest
+from vpd_lightning.training.checkpoint_files import load_checkpoint, write_checkpoint
 from vpd_lightning.training.checkpoints import find_resume
-from vpd_lightning.training.module import DATA_SHA256
 
 STEPS = 30
 TIMED = "rays_per_second"
@@ -123,8 +124,31 @@ def test_a_checkpoint_names_its_data_and_going_on_with_other_data_warns(
     tiny_trainer(tmp_path / "other", STEPS + 1).fit(tiny_module(), tiny_data(other), ckpt_path=last)
 
     assert "not what this training began with" in caplog.text
-    both = [load_manifest(folder).digest for folder in (data, other)]
-    assert load_checkpoint(tmp_path / "other/checkpoints/last.ckpt")[DATA_SHA256] == both
+    manifests = [load_manifest(folder) for folder in (data, other)]
+    stored = load_checkpoint(tmp_path / "other/checkpoints/last.ckpt")
+    assert stored[DATA_SHA256] == [manifest.digest for manifest in manifests]
+    seen = {checksum for manifest in manifests for checksum in manifest.checksums(manifest.split("train"))}
+    assert stored[TRAINED_ON] == sorted(seen)
+
+
+def test_a_training_that_goes_on_from_a_checkpoint_that_does_not_say_does_not_know_either(
+    data: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    old = load_checkpoint(uninterrupted / "checkpoints" / "last.ckpt")
+    assert old.pop(TRAINED_ON)
+    write_checkpoint(old, tmp_path / "old.ckpt")
+    tiny_trainer(tmp_path / "run", STEPS + 1).fit(tiny_module(), tiny_data(data), ckpt_path=tmp_path / "old.ckpt")
+    assert load_checkpoint(tmp_path / "run/checkpoints/last.ckpt")[TRAINED_ON] is None
+
+
+def test_going_on_with_another_division_of_the_same_files_warns(
+    data: Path, uninterrupted: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    other = Path(shutil.copytree(data, tmp_path / "data"))
+    split_dataset(other, train=3, validation=3, test=0, seed=1)
+    last = uninterrupted / "checkpoints" / "last.ckpt"
+    tiny_trainer(tmp_path / "run", STEPS + 1).fit(tiny_module(), tiny_data(other), ckpt_path=last)
+    assert "or its splits are not" in caplog.text
 
 
 def test_with_workers_or_another_start_nothing_changes(data: Path, uninterrupted: Path, tmp_path: Path) -> None:

@@ -106,8 +106,13 @@ def _validate(places: Sequence[str], settings: dict[str, Any]) -> int:
     path = _one_place("validate", places)
     _only("validate", settings, ())
     from data_gen.inspection.validate import check_dataset
+    from vpd_lightning.data.manifest import load_manifest
+    from vpd_lightning.data.verdict import keep_verdict
 
     report = check_dataset(path)
+    is_whole = path.is_dir() and not any(fault.name == "manifest" for fault in report.faults)
+    if is_whole and (reason := keep_verdict(load_manifest(path), report.faults)):
+        print(f"remark: {reason}")
     for fault in report.faults:
         print(fault)
     if report.summary:

@@ -36,7 +36,10 @@ def _export(config: Mapping[str, Any]) -> None:
     num_rays = config["renderer_program"]
     _check(config, source)
     model = load_model(source)
-    trained = TrainedSystem(system=model.simulator, config=model.config, checkpoint=model.path, step=model.step)
+    trained = TrainedSystem(
+        system=model.simulator, config=model.config, checkpoint=model.path, step=model.step,
+        sha256=model.sha256, trained_on=model.trained_on,
+    )  # fmt: skip
     metrics = None if is_release(source) else find_metrics(trained, config["metrics"])
     with OutputFolder(folder) as partial:
         if num_rays is not None:  # first: it counts among the megabytes

@@ -26,7 +26,7 @@ def _run(words: list[str]) -> int:
 def _render(config: Mapping[str, Any]) -> None:
     import torch
 
-    from vpd_lightning.data.manifest import file_sha256
+
     from vpd_lightning.editing.colored_editor import colored_editor
     from vpd_lightning.editing.edit_files import load_edit, replay
     from vpd_lightning.errors import OutOfMemoryError
@@ -81,7 +81,7 @@ def _render(config: Mapping[str, Any]) -> None:
             partial / "render.json",
             {
                 "checkpoint": str(model.path),
-                "checkpoint_sha256": file_sha256(model.path),
+                "checkpoint_sha256": model.sha256,
                 "data": str(manifest.folder),
                 "trajectory": manifest.relative(path),
                 "start_frame": start,

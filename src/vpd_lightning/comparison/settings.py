@@ -11,8 +11,8 @@ from vpd_lightning.errors import VPDError
 
 # Settings that change what a run says, keeps or costs, but not what it learns; and those with columns of their own.
 _NOT_COMPARED = (
-    "experiment", "system", "seed", "sweep_name", "evaluate", "run", "resume", "debug", "num_threads", "logger",
-    "protocol", "generate", "pretraining.ckpt", "data.folder", "data.num_workers", "data.cache",
+    "experiment", "system", "seed", "sweep_name", "evaluate", "run", "resume", "debug", "force", "num_threads",
+    "logger", "protocol", "generate", "pretraining.ckpt", "data.folder", "data.num_workers", "data.cache",
     "data.num_validation_clips", "data.num_validation_steps", "data.validation_views", "trainer.default_root_dir",
     "trainer.log_every_n_steps", "trainer.enable_progress_bar", "trainer.enable_model_summary",
     "trainer.val_check_interval", "trainer.check_val_every_n_epoch", "trainer.limit_val_batches",

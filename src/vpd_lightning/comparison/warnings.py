@@ -54,7 +54,7 @@ def board_warnings(board: Board) -> list[str]:
     )
     if len({tuple(run.metrics["protocol"].get("input_views") or ()) for row in rows for run in row.runs}) > 1:
         found.append(f"the systems do not look through the same cameras; input views: {views}.")
-    found += _other_data(board)
+    found += [*_other_data(board), *_trained_on(board)]
     broken = [str(run.folder) for run in board.runs if run.metrics.get("finite") is False]
     if broken:
         found.append(
@@ -74,6 +74,17 @@ def _other_data(board: Board) -> list[str]:
     trained = [(run, (run.metrics.get("training") or {}).get("data_sha256")) for run in board.runs]
     other = [str(run.folder) for run, digest in trained if digest not in (None, board.data_sha256)]
     return [f"these were trained on another data set than they are evaluated on: {', '.join(other)}."] if other else []
+
+
+def _trained_on(board: Board) -> list[str]:
+    """Say which runs were evaluated on what they were trained on, and of which that is not known."""
+    seen = [(str(run.folder), (run.metrics.get("seen_in_training") or {}).get("trajectories")) for run in board.runs]
+    some = [f"{folder} ({count} trajectories)" for folder, count in seen if count]
+    unknown = [folder for folder, count in seen if count is None]
+    found = [f"these were trained on what they are evaluated on: {', '.join(some)}."] if some else []
+    if unknown:
+        found.append(f"it is not known whether these were trained on what they are evaluated on: {', '.join(unknown)}.")
+    return found
 
 
 def _by_row(rows: Sequence[Row], pick: object) -> str:

@@ -87,6 +87,7 @@ class TrainConfig:
     deterministic: bool = MISSING
     num_threads: int | None = None
     debug: bool = MISSING
+    force: bool = MISSING
     resume: str | None = None
     run: RunConfig = MISSING
     model: Any = MISSING
@@ -137,6 +138,7 @@ class EvalConfig:
     sleeping: bool = MISSING
     hide_depth: bool = MISSING
     data: DataChoice = MISSING
+    force: bool = MISSING
     out: str | None = None
     device: str = MISSING
     num_videos: int = MISSING

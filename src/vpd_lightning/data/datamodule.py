@@ -80,6 +80,7 @@ class VideoDataModule(pl.LightningDataModule):
         self.validation_views, self.load_future = validation_views, load_future
         self.num_context_frames = NUM_CONTEXT_FRAMES
         self.data_sha256: str | None = None  # of the data set; known from setup on
+        self.trained_on: list[str] | None = None  # SHA-256 of each trajectory that clips are drawn from; as above
         self.trajectories: list[TrajectoryFrames] = []
         self.validation: ValidationClips | None = None
         self._medians: dict[int, tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]] = {}
@@ -98,6 +99,7 @@ class VideoDataModule(pl.LightningDataModule):
                 f"Use 1 to {len(files)}, or null for all."
             )
         self.trajectories = [TrajectoryFrames(path, self.cache) for path in files[:wanted]]
+        self.trained_on = manifest.checksums(files[:wanted])
         if self.num_validation_clips:
             held_out = manifest.split("validation")[: self.num_validation_clips]
             self.validation = ValidationClips(

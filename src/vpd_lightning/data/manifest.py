@@ -1,8 +1,9 @@
 """``dataset.json``: which trajectories a data set holds, in which split, and the SHA-256 of each file."""
 
+import difflib
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,6 +14,10 @@ from vpd_lightning.files import AtomicPath
 
 FILE_NAME = "dataset.json"
 UNFINISHED_NAME = ".unfinished.json"  # what a data set in the making was asked to be
+DATA_SHA256 = "data_sha256"
+"""Where a checkpoint keeps the digests of the data sets it was trained on: more than one if it went on with another."""
+TRAINED_ON = "trained_on_sha256"
+"""Where a checkpoint or a released model keeps the SHA-256 of each trajectory that a training saw; null: not known."""
 SPLITS = ("train", "validation", "test")
 _MAX_BYTES = 64 * 2**20
 _MAX_TRAJECTORIES = 400_000
@@ -47,11 +52,38 @@ class Manifest:
             raise DataError(f"{self.folder} has no split {name!r}.\nSplits with trajectories: {present}.")
         return self.splits[name]
 
+    def checksums(self, paths: Iterable[Path]) -> list[str]:
+        """Return the SHA-256 of some of its files: what tells a trajectory, whatever its name or folder."""
+        return [self.sha256[self.relative(path)] for path in paths]
+
     @property
     def digest(self) -> str:
-        """SHA-256 over the names and checksums of all files: two data sets with one digest hold the same bytes."""
+        """SHA-256 over names, checksums and splits: with one digest, two data sets are the same and divided alike.
+
+        A split is named where it is not the one that the file's folder says, so that sets which were never divided
+        anew keep the digest that earlier versions gave them.
+        """
+        splits = {self.relative(path): split for split, files in self.splits.items() for path in files}
+        moved = {name: "" if name.partition("/")[0] == split else f" {split}" for name, split in splits.items()}
+        lines = "".join(f"{name} {value}{moved[name]}\n" for name, value in sorted(self.sha256.items()))
+        return hashlib.sha256(lines.encode()).hexdigest()
+
+    @property
+    def files_digest(self) -> str:
+        """SHA-256 over names and checksums alone: it stays as it is where the same files are divided anew."""
         lines = "".join(f"{name} {value}\n" for name, value in sorted(self.sha256.items()))
         return hashlib.sha256(lines.encode()).hexdigest()
+
+    def repeated(self) -> list[tuple[Path, Path]]:
+        """Return pairs of files of different splits that hold the same bytes: one trajectory under two names."""
+        first: dict[str, tuple[str, Path]] = {}
+        pairs = []
+        for split, files in self.splits.items():
+            for path, checksum in zip(files, self.checksums(files), strict=True):
+                other, twin = first.setdefault(checksum, (split, path))
+                if other != split:
+                    pairs.append((twin, path))
+        return pairs
 
 
 def write_manifest(manifest: Manifest) -> Path:
@@ -203,7 +235,24 @@ def _missing(folder: Path) -> str:
     else:  # the name does not say what should be in there
         command, hint = "scene=SCENE preset=PRESET", "  (vpd-data --help lists both)"
     return (
-        f"No data set in {folder} (there is no {FILE_NAME}).\n"
+        f"No data set in {folder} (there is no {FILE_NAME}).{did_you_mean(folder)}\n"
         f"Make it:  vpd-data generate {command} out={folder}{hint}\n"
         "or point data.folder at one that exists."
     )
+
+
+def did_you_mean(folder: Path) -> str:
+    """Return a line that names the data sets nearby whose names are much like this one's, or nothing."""
+    places = [folder.parent] if folder.parent.is_dir() else _subfolders(folder.parent.parent)
+    known = {
+        f"{place.name}/{path.parent.name}": path.parent for place in places for path in place.glob(f"*/{FILE_NAME}")
+    }
+    near = difflib.get_close_matches(f"{folder.parent.name}/{folder.name}", sorted(known), n=3, cutoff=0.7)
+    return f"\nDid you mean {' or '.join(str(known[name]) for name in near)}?" if near else ""
+
+
+def _subfolders(place: Path) -> list[Path]:
+    try:
+        return [path for path in place.iterdir() if path.is_dir()]
+    except OSError:
+        return []

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.errors import DataError
+from vpd_lightning.evaluation.kept_mean import kept_training_mean
 from vpd_lightning.evaluation.long_rollout import LongRollout, judge_long_rollout
 from vpd_lightning.evaluation.measuring import SYSTEMS, ClipResult, measure_clip
 from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
@@ -27,7 +28,7 @@ from vpd_lightning.evaluation.prediction import (
     without_depth,
 )
 from vpd_lightning.evaluation.protocol import Protocol, read_clips
-from vpd_lightning.evaluation.references import median_displacements, training_mean
+from vpd_lightning.evaluation.references import median_displacements
 
 Progress = Callable[[str, int, int], None]
 
@@ -99,7 +100,7 @@ def evaluate(
     paths = manifest.split(protocol.split)[: protocol.num_trajectories]
     progress("references", 0, 1)
     train_paths = manifest.split("train")
-    mean_image = training_mean(train_paths)
+    mean_image = kept_training_mean(manifest)
     constants = median_displacements(train_paths, protocol.start_frames, protocol.num_steps)
     watch = {"references": time.perf_counter() - began, "read": 0.0, "measure": 0.0}
     num_clips = len(paths) * len(protocol.start_frames)

@@ -11,6 +11,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
         f"{protocol['split']}: {protocol['num_trajectories']} trajectories, {protocol['num_clips']} clips, "
         f"{protocol['num_steps']} steps, {protocol['num_views']} views"
         + ("" if metrics["finite"] else "  (NOT FINITE: some predictions are NaN or infinite)"),
+        *_seen_lines(metrics),
         "",
         f"{'':24}{'model':>9}{'copy last':>11}{'train mean':>12}{'gain':>8}",
         _image_line("PSNR (dB)", metrics, "psnr", 2),
@@ -25,6 +26,16 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     if metrics["long_rollout"]:
         lines += ["", *_long_lines(metrics["long_rollout"])]
     return lines
+
+
+def _seen_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Say whether a training saw what is evaluated, where it did, or where nobody knows."""
+    seen = metrics.get("seen_in_training") or {"trajectories": None}
+    if seen["trajectories"] is None:
+        return ["whether these trajectories were trained on is not known: the checkpoint does not say"]
+    if not seen["trajectories"]:
+        return []
+    return [f"TRAINED ON: {seen['trajectories']} of these {seen['of']} trajectories, so this says little of new ones"]
 
 
 def _other_lines(metrics: Mapping[str, Any]) -> list[str]:

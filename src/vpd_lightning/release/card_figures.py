@@ -11,12 +11,15 @@ SCORES = (("PSNR (dB)", "psnr", 2), ("PSNR of moving pixels (dB)", "psnr_moving"
 def figure_lines(metrics: Mapping[str, Any]) -> list[str]:
     """Return the table of figures with both references, and the lines under it."""
     protocol = metrics["protocol"]
+    seen = (metrics.get("seen_in_training") or {}).get("trajectories")
+    unseen = " that no training saw" if seen == 0 else ""
     lines = [
-        f"Split `{protocol['split']}`: {protocol['num_trajectories']} trajectories that no training saw, "
+        f"Split `{protocol['split']}`: {protocol['num_trajectories']} trajectories{unseen}, "
         f"{protocol['num_clips']} clips, {protocol['num_steps']} predicted steps, {protocol['num_views']} cameras "
         f"({len(protocol['input_views'])} of them inputs). Means over images with 95 % bootstrap intervals over "
         "trajectories, beside two references: the last input frame repeated, and the mean image of each camera over "
         "the training set. `metrics.json` has the rest.",
+        *_doubt(seen),
         "",
         "| | model | 95 % interval | last frame repeated | training mean |",
         "|---|---:|---:|---:|---:|",
@@ -36,6 +39,13 @@ def figure_lines(metrics: Mapping[str, Any]) -> list[str]:
         value = f"{_number(native['psnr'], 2)} dB, SSIM {_number(native['ssim'], 3)}"
         lines += ["", f"At the resolution it was trained at ({native['resolution']} pixels): PSNR {value}."]
     return lines
+
+
+def _doubt(seen: int | None) -> list[str]:
+    """A line where it is not sure that the figures are about trajectories that no training saw."""
+    if seen is None:
+        return ["", "Whether a training saw some of these trajectories is unknown: its checkpoint did not say."]
+    return ["", f"**{seen} of these trajectories were trained on.**"] if seen else []
 
 
 def beaten_by(metrics: Mapping[str, Any], name: str) -> list[str]:

@@ -10,6 +10,7 @@ import torch
 import yaml
 from torch import Tensor, nn
 
+from vpd_lightning.data.manifest import TRAINED_ON
 from vpd_lightning.errors import CheckpointError, ConfigError
 from vpd_lightning.release.model_card import CardContent, model_card
 from vpd_lightning.release.portable import absolute_paths, portable_config, portable_metrics
@@ -33,12 +34,18 @@ _MEGABYTE = 10**6
 
 @dataclass(frozen=True)
 class TrainedSystem:
-    """What is released: a system with its trained weights, its plain configuration, its checkpoint and its update."""
+    """What is released: a system with its trained weights, its plain configuration, its checkpoint and its update.
+
+    ``sha256`` is that of the checkpoint; ``trained_on`` holds those of the trajectories that a training saw, where
+    known.
+    """
 
     system: nn.Module
     config: Mapping[str, Any]
     checkpoint: Path
     step: int
+    sha256: str
+    trained_on: frozenset[str] | None
 
 
 def find_metrics(trained: TrainedSystem, metrics_file: str | None) -> dict[str, Any]:
@@ -66,7 +73,7 @@ def find_metrics(trained: TrainedSystem, metrics_file: str | None) -> dict[str, 
     if wrong is not None:
         raise ConfigError(f"{path}: {wrong} is not what vpd-eval writes.\nGive metrics=FILE, as vpd-eval writes it.")
     _require_plain_test(metrics, path, trained.checkpoint)
-    if metrics["checkpoint_sha256"] != sha256(trained.checkpoint.read_bytes()):
+    if metrics["checkpoint_sha256"] != trained.sha256:
         raise ConfigError(
             f"{path} has the figures of another checkpoint than {trained.checkpoint}.\n"
             f"Measure this one: vpd-eval ckpt={trained.checkpoint}; then metrics=FILE with its metrics.json."
@@ -103,6 +110,12 @@ def _require_plain_test(metrics: Mapping[str, Any], path: Path, checkpoint: Path
     split = metrics["protocol"].get("split")
     if split != "test":
         raise ConfigError(f"{path} is about the {split} split, and a card about the test split.\n{again}")
+    count = (metrics.get("seen_in_training") or {}).get("trajectories")
+    if count:
+        raise ConfigError(
+            f"{path} is about trajectories of which {count} were trained on, and a card about new ones.\n"
+            "Measure it on a test split that no training saw; `vpd-eval data.folder=FOLDER` chooses the data set."
+        )
 
 
 def write_release(
@@ -134,6 +147,7 @@ def write_release(
         "num_parameters": num_parameters,
         "psnr": figures["psnr"]["mean"],
         "sha256": {file: sha256(content[file]) for file in CHECKED_FILES} | _program_digest(folder),
+        TRAINED_ON: None if trained.trained_on is None else sorted(trained.trained_on),
     }
     environment = _run_file(trained.checkpoint, "environment.json") or {}
     card = CardContent(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from vpd_lightning.data.manifest import TRAINED_ON
 from vpd_lightning.errors import CheckpointError
 from vpd_lightning.release.portable import absolute_paths
 
@@ -26,17 +27,23 @@ CHECKED_FILES = (WEIGHTS_FILE, CONFIG_FILE, METRICS_FILE)
 """Files whose SHA-256 stands in the index, as that of a renderer's program does; the card is for people."""
 
 _MAX_TEXT_BYTES = 4 * 2**20
+_MAX_INDEX_BYTES = 64 * 2**20  # it names every trajectory of the training
 _AGAIN = "Fetch the folder again, or export the model again with vpd-export."
 
 
 @dataclass(frozen=True)
 class ReleasedModel:
-    """What a released folder holds: weights by their names in the system's state dict, and how to build the system."""
+    """What a released folder holds: weights by their names in the system's state dict, and how to build the system.
+
+    ``sha256`` is that of the weights' file; ``trained_on`` holds those of the trajectories a training saw, where known.
+    """
 
     path: Path
     weights: "dict[str, Tensor]"
     config: dict[str, Any]
     step: int
+    sha256: str
+    trained_on: list[str] | None
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -69,6 +76,8 @@ def read_release(path: Path) -> ReleasedModel:
         weights=_parse_weights(folder / WEIGHTS_FILE, content[WEIGHTS_FILE]),
         config=_parse_config(folder / CONFIG_FILE, content[CONFIG_FILE]),
         step=index["step"],
+        sha256=index["sha256"][WEIGHTS_FILE],
+        trained_on=index.get(TRAINED_ON),
     )
 
 
@@ -79,7 +88,7 @@ def read_index(folder: Path) -> dict[str, Any]:
         CheckpointError: it is missing, or not an index of ours.
     """
     path = folder / INDEX_FILE
-    text = _read_bytes(path, _MAX_TEXT_BYTES)
+    text = _read_bytes(path, _MAX_INDEX_BYTES)
     try:
         index = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -93,6 +102,8 @@ def read_index(folder: Path) -> dict[str, Any]:
     wrong = [
         name for name, kind in wanted.items() if not isinstance(index.get(name), kind) or isinstance(index[name], bool)
     ]
+    if not isinstance(index.get(TRAINED_ON), list | None):
+        wrong.append(TRAINED_ON)
     if wrong or not is_whole:
         raise CheckpointError(f"{path} lacks {', '.join([*wrong, *(() if is_whole else ('checksums',))])}.\n{_AGAIN}")
     return index

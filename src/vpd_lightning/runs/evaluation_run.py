@@ -7,25 +7,23 @@ from typing import Any
 import torch
 import yaml
 
-from vpd_lightning.data.manifest import Manifest, file_sha256
+from vpd_lightning.data.manifest import Manifest
+from vpd_lightning.data.manifest import DATA_SHA256
 from vpd_lightning.errors import ConfigError, OutOfMemoryError
 from vpd_lightning.evaluation.evaluate import Evaluation, evaluate
-from vpd_lightning.evaluation.gallery import write_gallery
 from vpd_lightning.evaluation.prediction import PredictsVideo, PredictsViews
 from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.evaluation.report import metrics_of, write_metrics
 from vpd_lightning.evaluation.rollouts import MAX_CLIPS, write_rollouts
+from vpd_lightning.evaluation.seen import seen_in_training
 from vpd_lightning.evaluation.summary import summary_lines
 from vpd_lightning.evaluation.web_page import write_web_page
 from vpd_lightning.files import OutputFolder, choose_folder
 from vpd_lightning.loading import LoadedModel, load_model
-from vpd_lightning.release.release_folder import is_release
 from vpd_lightning.release.results_folder import beside_checkpoint
 from vpd_lightning.runs.one_recording import data_set
 from vpd_lightning.runs.progress import show_progress
 from vpd_lightning.runs.threads import set_threads
-from vpd_lightning.training.checkpoint_files import load_checkpoint
-from vpd_lightning.training.module import DATA_SHA256
 
 _DEFAULT_SYSTEM = "vpd"  # checkpoints from before there were others do not say
 
@@ -43,20 +41,22 @@ def run_evaluation(config: Mapping[str, Any]) -> Path:
     _require_predictions(model)
     protocol = choose_protocol(config["protocol"], model.config.get("protocol"))
     manifest = data_set(config["data"]["folder"], model.config)
+    seen = seen_in_training(manifest, protocol, model.trained_on, force=config["force"])
     name = "evaluation" if protocol.split == "test" else f"evaluation_{protocol.split}"
     folder = choose_folder(config["out"], beside_checkpoint(model.path, name))
+    print(f"{model.name}, step {model.step}: {model.path}", flush=True)
     with OutputFolder(folder) as partial:
         evaluation = _evaluate(model, manifest, protocol, config)
-        metrics = metrics_of(evaluation, protocol, _identity(model, manifest, config))
+        metrics = metrics_of(evaluation, protocol, {**_identity(model, manifest, config), "seen_in_training": seen})
+        from vpd_lightning.evaluation.gallery import write_gallery  # matplotlib: not before it is needed
+
         write_gallery(partial, metrics, evaluation, config["num_videos"])
         write_rollouts(partial / "rollouts.npz", evaluation)
-        content = _content(model)
-        if content is not None:
-            _write_config(partial / "config.yaml", content["hyper_parameters"])
-        metrics["training"] = None if content is None else training_of(content, model.path)
+        if model.checkpoint is not None:
+            _write_config(partial / "config.yaml", model.checkpoint["hyper_parameters"])
+        metrics["training"] = None if model.checkpoint is None else training_of(model.checkpoint, model.path)
         path = folder / write_metrics(partial, metrics, evaluation).name
         write_web_page(partial, metrics)
-    print(f"{model.name}, step {model.step}: {model.path}")
     print("\n".join(summary_lines(metrics)))
     print()
     print(path)
@@ -99,11 +99,6 @@ def _evaluate(model: LoadedModel, manifest: Manifest, protocol: Protocol, config
         ) from error
 
 
-def _content(model: LoadedModel) -> dict[str, Any] | None:
-    """What the checkpoint says beside the weights; None for a released model, which has none."""
-    return None if is_release(model.path) else load_checkpoint(model.path)
-
-
 def _write_config(path: Path, config: Mapping[str, Any]) -> None:
     """Keep the settings the weights were trained with; those in the run folder are of its first start."""
     path.write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
@@ -140,7 +135,7 @@ def _identity(model: LoadedModel, manifest: Manifest, config: Mapping[str, Any])
         "seed": model.config.get("seed"),
         "num_parameters": sum(parameter.numel() for parameter in parameters),
         "checkpoint": str(model.path),
-        "checkpoint_sha256": file_sha256(model.path),
+        "checkpoint_sha256": model.sha256,
         "step": model.step,
         "data": str(manifest.folder),
         "data_sha256": manifest.digest,

@@ -13,6 +13,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from vpd_lightning.config import pretraining_config
 from vpd_lightning.config.migrations import upgraded
 from vpd_lightning.config.pretraining import FOLDER
+from vpd_lightning.data.manifest import TRAINED_ON
 from vpd_lightning.data.views.slot_store import INDEX_FILE
 from vpd_lightning.data.views.view_datamodule import FOLDER as SLOTS
 from vpd_lightning.errors import CheckpointError, ConfigError
@@ -85,14 +86,16 @@ def hand_over(
     callbacks: Sequence[Callback],
     folder: Path,
     config: Mapping[str, Any],
-) -> None:
+) -> list[str] | None:
     """Load the weights of the first training by name, let the data prepare what they need of it, count its time.
+
+    Returns the SHA-256 of each trajectory that the first training saw; None where its checkpoint does not say.
 
     Raises:
         CheckpointError: the second system differs from the first in what it takes from it.
         ConfigError: no time is left for the second training.
     """
-    load_pretrained(system, first.checkpoint, config)
+    trained_on = load_pretrained(system, first.checkpoint, config)
     budgets = [callback for callback in callbacks if isinstance(callback, TimeBudget)]
     prepare = getattr(datamodule, "prepare", None)
     if prepare is None:
@@ -102,6 +105,7 @@ def hand_over(
     for budget, seconds in zip(budgets, spent, strict=True):
         budget.seconds_before = first.seconds + seconds
         _require_time_left(budget.seconds_before, budget.minutes)
+    return trained_on
 
 
 def _place(datamodule: Any, folder: Path) -> Path:
@@ -130,8 +134,10 @@ def _prepared(prepare: Callable[[], None], place: Path, budgets: Sequence[TimeBu
         return spent
 
 
-def load_pretrained(system: AbstractSystem, checkpoint: Path, config: Mapping[str, Any]) -> None:
+def load_pretrained(system: AbstractSystem, checkpoint: Path, config: Mapping[str, Any]) -> list[str] | None:
     """Copy all weights of a checkpoint into a system that has them under the same names; the others stay as they are.
+
+    Returns the SHA-256 of each trajectory that the weights were trained on; None where the checkpoint does not say.
 
     Args:
         system: of the second training.
@@ -164,6 +170,7 @@ def load_pretrained(system: AbstractSystem, checkpoint: Path, config: Mapping[st
                 "Name a checkpoint of the first training that belongs to this model: pretraining.ckpt=RUN"
             )
     log.info("took %d of %d weights from %s", len(weights), len(own), checkpoint)
+    return content.get(TRAINED_ON)
 
 
 def _require_same_settings(

@@ -1,16 +1,22 @@
-"""Where a data set is missing: make it where the configuration says so, else say how."""
+"""Where a data set is missing: make it where it is the experiment's own, else say how. Refuse what is not trusted."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vpd_lightning.data.manifest import FILE_NAME
+from vpd_lightning.data.manifest import FILE_NAME, did_you_mean, load_manifest
 from vpd_lightning.errors import DataError
 
+_HOME = "datasets"
+"""Where the data sets of our experiments lie, each called after its experiment or scene, and its preset."""
 
-def provide_data(config: Mapping[str, Any]) -> None:
+
+def provide_data(config: Mapping[str, Any], overrides: Sequence[str] | None = None) -> None:
     """Generate the data set of a training's configuration where it is missing and ``generate.when_missing`` is true.
+
+    A folder that was given by name is not filled: it may be a mistyped one. What was given by name, ``overrides`` say
+    (the words of the command line); where they are not known, every folder but the experiment's own counts as given.
 
     Raises:
         DataError: it is missing, and nothing makes it here.
@@ -18,16 +24,21 @@ def provide_data(config: Mapping[str, Any]) -> None:
     folder, wanted = Path(config["data"]["folder"]), config.get("generate")
     if (folder / FILE_NAME).is_file():
         return
+    missing = f"there is no data set in {folder} (no {FILE_NAME}).{did_you_mean(folder)}"
     if wanted is None or wanted["scene"] is None:
         raise DataError(
-            f"there is no data set in {folder} (no {FILE_NAME}).\n"
-            "Point data.folder at one; vpd-data --help says how to generate or import recordings."
+            f"{missing}\nPoint data.folder at one; vpd-data --help says how to generate or import recordings."
         )
     command = f"vpd-data generate scene={wanted['scene']} preset={wanted['preset']} out={folder}"
     if not wanted["when_missing"]:
         raise DataError(
-            f"there is no data set in {folder} (no {FILE_NAME}).\nMake it: {command}\n"
+            f"{missing}\nMake it: {command}\n"
             "Or look first whether everything works, with a tiny one that makes itself: budget=tiny"
+        )
+    if not _may_fill(folder, config, overrides):
+        raise DataError(
+            f"{missing}\nA folder that is given by name is not filled by itself. Correct data.folder,\n"
+            f"or make it: {command}\nor have it made: generate.when_missing=true"
         )
     if int(os.environ.get("LOCAL_RANK", "0")) > 0:
         raise DataError(f"there is no data set in {folder}.\nMake it before training on several devices: {command}")
@@ -35,3 +46,27 @@ def provide_data(config: Mapping[str, Any]) -> None:
 
     print(f"there is no data set in {folder}; making it: {command}", flush=True)
     generate(scene=wanted["scene"], preset=wanted["preset"], out=folder, seed=wanted["seed"])
+
+
+def require_trusted_data(config: Mapping[str, Any]) -> None:
+    """Refuse a data set that failed validation or was never validated, unless ``force`` is true.
+
+    Raises:
+        DataError: see ``data.verdict.require_trusted``.
+    """
+    from vpd_lightning.data.verdict import require_trusted
+
+    if not config.get("force"):
+        require_trusted(load_manifest(config["data"]["folder"]))
+
+
+def _may_fill(folder: Path, config: Mapping[str, Any], overrides: Sequence[str] | None) -> bool:
+    wanted = config["generate"]
+    own = [Path(_HOME) / f"{name}_{wanted['preset']}" for name in (config.get("experiment"), wanted["scene"])]
+    if folder in own:
+        return True
+    if overrides is None:
+        return False
+    words = [word.lstrip("+") for word in overrides]
+    is_asked = "generate.when_missing=true" in [word.lower() for word in words]
+    return is_asked or not any(word.startswith("data.folder=") for word in words)

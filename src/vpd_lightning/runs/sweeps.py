@@ -116,7 +116,7 @@ def _attend_to(job: SweepJob, number: str, train: Callable[[list[str]], None]) -
         print(f"{number} {job.name}: {'going on' if is_resumed else 'starting'}", flush=True)
         _set_aside_evaluations(job.folder)
         with _locked(job.sweep_folder / _LOCKS / "data", is_patient=True):
-            provide_data(job.config)
+            provide_data(job.config, job.words)
         train([*job.words, *_settled(job.config), "resume=auto", f"run.folder={quote(str(job.folder))}"])
         (job.folder / FINISHED).write_text("Nothing is left to do here: the sweep passes this run by.\n")
         return RESUMED if is_resumed else DONE

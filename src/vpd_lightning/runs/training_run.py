@@ -20,7 +20,7 @@ from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.randomness import derive_seed
 from vpd_lightning.runs.environment import environment
 from vpd_lightning.runs.first_training import FirstTraining, hand_over, train_first
-from vpd_lightning.runs.provide_data import provide_data
+from vpd_lightning.runs.provide_data import provide_data, require_trusted_data
 from vpd_lightning.runs.resume import OVERRIDES_FILE, has_own_checkpoint, quote
 from vpd_lightning.runs.run_claim import claimed
 from vpd_lightning.runs.training_errors import (
@@ -73,7 +73,7 @@ def evaluate_run(folder: Path, config: Mapping[str, Any]) -> None:
     """Evaluate the last checkpoint as ``vpd-eval`` does: beside it, where a run that went on has earlier ones."""
     from vpd_lightning.runs.evaluation_run import run_evaluation
 
-    words = {"ckpt": folder / CHECKPOINTS / LAST, "num_threads": config["num_threads"]}
+    words = {"ckpt": folder / CHECKPOINTS / LAST, "num_threads": config["num_threads"], "force": config["force"]}
     settings = compose("eval", [f"{key}={quote(str(value))}" for key, value in words.items() if value is not None])
     run_evaluation(settings)
 
@@ -87,7 +87,8 @@ def fit(
     first: FirstTraining | None,
 ) -> None:
     """Build everything and train: anew, from a checkpoint, or from the weights of a first training."""
-    provide_data(config)
+    provide_data(config, overrides)
+    require_trusted_data(config)
     datamodule = build(config["data"], LightningDataModule, "data")
     datamodule.setup("fit")
     system = _build_system(config)
@@ -100,7 +101,7 @@ def fit(
     )
     callbacks = build_list(config["callbacks"], Callback, "callbacks")
     if first is not None:
-        hand_over(first, system, datamodule, callbacks, folder, config)
+        module.remember(hand_over(first, system, datamodule, callbacks, folder, config))
     trainer = build(
         config["trainer"],
         Trainer,

@@ -7,6 +7,7 @@ import pickle
 import re
 import tempfile
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,15 @@ _MARK = b"vpd-sha256:"
 _TRAILER_LENGTH = len(_MARK) + 64
 _PARTIAL_SUFFIX = ".partial"
 _ADDRESS = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]+:/")
+
+
+@dataclass(frozen=True)
+class OpenedCheckpoint:
+    """A checkpoint that was read, checked and hashed once; ``sha256`` is that of the whole file."""
+
+    path: Path
+    content: dict[str, Any]
+    sha256: str
 
 
 def write_checkpoint(content: dict[str, Any], path: Path) -> None:
@@ -56,18 +66,28 @@ def write_checkpoint(content: dict[str, Any], path: Path) -> None:
 
 
 def load_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
+    """Return the content of a checkpoint; see ``open_checkpoint``."""
+    return open_checkpoint(path, map_location).content
+
+
+def open_checkpoint(path: str | Path, map_location: Any = "cpu") -> OpenedCheckpoint:
     """Read a checkpoint of ours: checksum first, then plain tensors and containers only (nothing in it can run).
 
     Raises CheckpointError where the file is missing, damaged, not ours, without weights, or an internet address.
     """
-    loaded = read_checkpoint(path, map_location)
+    loaded, sha256 = _read(path, map_location)
     if not isinstance(loaded, dict) or "state_dict" not in loaded:
         raise CheckpointError(f"{path} holds no weights (no state_dict).\nUse a checkpoint that vpd-train wrote.")
-    return loaded
+    return OpenedCheckpoint(Path(path), loaded, sha256)
 
 
 def read_checkpoint(path: str | Path, map_location: Any) -> Any:
     """Read what ``load_checkpoint`` reads, weights or not."""
+    return _read(path, map_location)[0]
+
+
+def _read(path: str | Path, map_location: Any) -> tuple[Any, str]:
+    """Return what a checkpoint holds, and the SHA-256 of the file."""
     if _ADDRESS.match(str(path)):
         raise CheckpointError(f"{path} is an internet address.\nFetch the file first, then give its path.")
     path = Path(path)
@@ -85,14 +105,17 @@ def read_checkpoint(path: str | Path, map_location: Any) -> Any:
         raise CheckpointError(f"{path} {what}: it does not end in our checksum.\nUse another checkpoint of the run.")
     body = memoryview(content)[: -_TRAILER_LENGTH - 2]
     length_fits = content[-_TRAILER_LENGTH - 2 : -_TRAILER_LENGTH] == _TRAILER_LENGTH.to_bytes(2, "little")
-    if not length_fits or hashlib.sha256(body).hexdigest().encode() != trailer[len(_MARK) :]:
+    digest = hashlib.sha256(body)
+    if not length_fits or digest.hexdigest().encode() != trailer[len(_MARK) :]:
         raise CheckpointError(f"{path} is damaged: its checksum does not fit.\nUse another checkpoint of the run.")
     try:
-        return torch.load(io.BytesIO(content), map_location=map_location, weights_only=True)
+        loaded = torch.load(io.BytesIO(content), map_location=map_location, weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, zipfile.BadZipFile, EOFError, ValueError) as error:
         raise CheckpointError(
             f"{path} holds more than tensors and plain containers, and is not opened.\n{str(error).splitlines()[0]}"
         ) from error
+    digest.update(content[len(body) :])
+    return loaded, digest.hexdigest()
 
 
 def keep_previous(last: Path) -> None:

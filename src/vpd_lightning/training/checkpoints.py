@@ -4,7 +4,7 @@ import logging
 from pathlib import Path
 
 from vpd_lightning.errors import CheckpointError
-from vpd_lightning.training.checkpoint_files import LAST, PREVIOUS, load_checkpoint
+from vpd_lightning.training.checkpoint_files import LAST, PREVIOUS, OpenedCheckpoint, open_checkpoint
 
 FOLDER = "checkpoints"
 FIRST_TRAINING = "pretraining"
@@ -18,10 +18,14 @@ def find_resume(folder: str | Path) -> Path:
 
     Where ``last.ckpt`` is damaged, warns and returns the one before it. Raises CheckpointError where none is good.
     """
+    return open_resume(folder).path
+
+
+def open_resume(folder: str | Path) -> OpenedCheckpoint:
+    """Open the checkpoint that ``find_resume`` finds."""
     folder = Path(folder)
     if folder.is_file():
-        load_checkpoint(folder)
-        return folder
+        return open_checkpoint(folder)
     inside = folder / FOLDER if (folder / FOLDER).is_dir() else folder
     candidates = [inside / name for name in (LAST, PREVIOUS) if (inside / name).is_file()]
     if not candidates:
@@ -32,13 +36,13 @@ def find_resume(folder: str | Path) -> Path:
     first_error: CheckpointError | None = None
     for path in candidates:
         try:
-            load_checkpoint(path)
+            opened = open_checkpoint(path)
         except CheckpointError as error:
             first_error = first_error or error
             continue
         if first_error is not None:
             log.warning("%s Going on from the checkpoint before it, %s.", str(first_error).splitlines()[0], path.name)
-        return path
+        return opened
     assert first_error is not None
     raise first_error
 

@@ -2,13 +2,14 @@
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from torch import Tensor, nn
 
+from vpd_lightning.data.manifest import DATA_SHA256, TRAINED_ON
 from vpd_lightning.data.validation import VideoClip
 from vpd_lightning.errors import ConfigError, NonFiniteError
 from vpd_lightning.losses.base import AbstractLoss
@@ -18,8 +19,6 @@ from vpd_lightning.training.optimization import AbstractOptimization
 from vpd_lightning.types import VideoBatch, ViewBatch
 
 BEST_METRIC = "validation/psnr"
-DATA_SHA256 = "data_sha256"
-"""Where a checkpoint keeps the digests of the data sets it was trained on: more than one if it went on with another."""
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +56,7 @@ class VPDModule(pl.LightningModule):
         self.expected_steps: Callable[[], int] | None = None
         self._clips: Sequence[str] = ()
         self._earlier_data: list[str] = []
+        self._earlier_trajectories: frozenset[str] | None = frozenset()
         self.seconds_per_step: float | None = None
         self._last_start: float | None = None
 
@@ -73,23 +73,34 @@ class VPDModule(pl.LightningModule):
     # -- what a checkpoint says of its data ----------------------------------------------------------------------------
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the digests of the data sets that were trained on, in order."""
+        """Keep the digests of the data sets that were trained on, in order, and of all their trajectories."""
         now = self._data_sha256()
         checkpoint[DATA_SHA256] = [*self._earlier_data, *([now] if now and now not in self._earlier_data else [])]
+        now_seen, before = self._of_data("trained_on"), self._earlier_trajectories
+        checkpoint[TRAINED_ON] = None if now_seen is None or before is None else sorted({*now_seen, *before})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Warn where a training goes on with other data than before."""
+        """Warn where a training goes on with other data than before, or with another division of them."""
+        self.remember(checkpoint.get(TRAINED_ON))
         self._earlier_data, now = list(checkpoint.get(DATA_SHA256) or []), self._data_sha256()
         if now and self._earlier_data and self._earlier_data != [now]:
             log.warning(
-                "the data set is not what this training began with (SHA-256 %s, was %s)",
+                "the data set is not what this training began with, or its splits are not (SHA-256 %s, was %s)",
                 now[:12],
                 self._earlier_data[0][:12],
             )
 
+    def remember(self, trajectories: Iterable[str] | None) -> None:
+        """Count what an earlier training saw (SHA-256 of each trajectory) among what this one saw; None: not known."""
+        before = self._earlier_trajectories
+        self._earlier_trajectories = None if trajectories is None or before is None else before.union(trajectories)
+
     def _data_sha256(self) -> str | None:
+        return self._of_data("data_sha256")
+
+    def _of_data(self, name: str) -> Any:
         trainer = self._trainer  # absent where a checkpoint is read without one
-        return getattr(getattr(trainer, "datamodule", None), "data_sha256", None)
+        return getattr(getattr(trainer, "datamodule", None), name, None)
 
     # -- training ------------------------------------------------------------------------------------------------------
 

@@ -54,7 +54,8 @@ def test_files_and_checksums_stay(folder: Path):
     split_dataset(folder, train=0.5, validation=0.3, test=0.2, seed=4)
 
     after = load_manifest(folder)
-    assert after.sha256 == before.sha256 and after.num_bytes == before.num_bytes and after.digest == before.digest
+    assert after.sha256 == before.sha256 and after.num_bytes == before.num_bytes
+    assert after.files_digest == before.files_digest and after.digest != before.digest, "splits belong to the digest"
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*.h5")} == times
     assert (after.settings, after.scene, after.seed) == (before.settings, before.scene, before.seed)
     assert not list(folder.glob(".*"))
@@ -142,3 +143,12 @@ def test_damaged_data_sets_are_refused(folder: Path):
         split_dataset(folder, train=0.5, validation=0.5)
     with pytest.raises(DataError, match="No data set"):
         split_dataset(folder / "nothing", train=1)
+
+
+def test_copies_of_a_file_stay_together(folder: Path):
+    for seed in range(5):
+        (folder / "train" / "000003.h5").write_bytes((folder / "train" / "000001.h5").read_bytes())
+        write_dataset_file(folder, {"train": sorted(folder.glob("*/*.h5")), "validation": [], "test": []})
+        split_dataset(folder, train=0.5, validation=0.25, test=0.25, seed=seed)
+        assert sum({"000001.h5", "000003.h5"} <= set(names) for names in division(folder).values()) >= 1
+        assert not load_manifest(folder).repeated()

@@ -5,6 +5,8 @@ can use to read any file of the user; it can also ask for filters that load plug
 kilobytes to many gigabytes.
 """
 
+import errno
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from vpd_lightning.data.busy import busy_error
 from vpd_lightning.data.hdf5.broken_file import BrokenFileError, brief, refuse
 from vpd_lightning.data.hdf5.text_heaps import are_heaps_sound
 from vpd_lightning.errors import DataError
@@ -45,6 +48,8 @@ _DAMAGE = (
     ArithmeticError,
     MemoryError,
 )
+# What is wrong with rights, disks and limits, and not with the file.
+_OF_THE_SYSTEM = (errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ESTALE)
 
 
 @contextmanager
@@ -55,14 +60,30 @@ def named_damage(path: Path) -> Iterator[None]:
     except DataError:
         raise
     except _DAMAGE as error:
-        raise refuse(path, "damaged_file", f"is damaged ({brief(error)})", _COPY_AGAIN) from error
+        damaged = refuse(path, "damaged_file", f"is damaged ({brief(error)})", _COPY_AGAIN)
+        raise _not_its_fault(path, error) or damaged from error
+
+
+def _not_its_fault(path: Path, error: BaseException) -> BrokenFileError | None:
+    """Return the error where the system, or another program, kept us from reading: a file to keep, not to delete."""
+    number = getattr(error, "errno", None)
+    busy = busy_error(path, error)
+    if busy is not None or number not in _OF_THE_SYSTEM:
+        return busy
+    return refuse(
+        path,
+        "unreadable",
+        f"cannot be read: {os.strerror(number)} ({brief(error)})",
+        "Nothing says that it is damaged. Mend what the system complains about, then try again.",
+    )
 
 
 def open_file(path: Path) -> h5py.File:
     """Open a file read-only after checking that every link in it stays inside the file.
 
     Raises:
-        DataError: missing, not HDF5, truncated, damaged, or with anything but a plain tree of groups and data sets.
+        DataError: missing, busy, not HDF5, truncated, damaged, or with anything but a plain tree of groups and data
+            sets.
     """
     if not path.is_file():
         way_out = "Check the path; `vpd-data inspect FOLDER` lists what is there."
@@ -71,6 +92,8 @@ def open_file(path: Path) -> h5py.File:
         # Files never change once complete, so no lock is needed (and read-only media offer none).
         file = h5py.File(path, "r", locking=False)
     except _DAMAGE as error:
+        if (kept := _not_its_fault(path, error)) is not None:
+            raise kept from error
         is_hdf5 = _is_hdf5(path)
         kind, fault = ("damaged_file", "is truncated or damaged") if is_hdf5 else ("not_hdf5", "is not an HDF5 file")
         raise refuse(path, kind, f"{fault} ({brief(error)})", _COPY_AGAIN) from error
@@ -225,7 +248,7 @@ def read_all(path: Path, dataset: h5py.Dataset, selection: Any = ()) -> np.ndarr
 
 def damaged_data(path: Path, name: str | None, error: BaseException) -> BrokenFileError:
     """Return the error for bytes that do not unpack, or whose checksum differs."""
-    return refuse(
+    return _not_its_fault(path, error) or refuse(
         path,
         "damaged_data",
         f"{name!r} cannot be read, its bytes are damaged ({brief(error)})",

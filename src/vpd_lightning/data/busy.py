@@ -1,0 +1,67 @@
+"""Telling a file that another program holds open from one that is damaged."""
+
+import errno
+import os
+from pathlib import Path
+
+from vpd_lightning.data.hdf5.broken_file import BrokenFileError, refuse
+
+KIND = "busy"
+_NUMBERS = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY, errno.ETXTBSY)
+# HDF5 gives these no number of their own.
+_MARKED_OPEN, _OPEN_IN_HERE = "already open for write", "file locking flag values don't match"
+_MAX_NAMED = 3
+
+
+def busy_error(path: Path, error: BaseException) -> BrokenFileError | None:
+    """Return the error that says who holds the file, or None where nobody does and ``error`` is about its bytes."""
+    text = str(error)
+    writers = _programs(path, writing=True)
+    is_marked = _MARKED_OPEN in text
+    if not (writers or is_marked or _OPEN_IN_HERE in text or getattr(error, "errno", None) in _NUMBERS):
+        return None
+    holders = writers or _programs(path, writing=False)
+    who = f"held open by {', '.join(holders[:_MAX_NAMED])}" if holders else "held open by another program"
+    way_out = "Nothing is wrong with it. Let that program close it, then try again."
+    if is_marked and not holders:
+        who = "marked as open for writing; no program that can be seen here holds it"
+        way_out = f"Where a program was killed while it wrote, `h5clear -s {path}` removes the mark; validate it then."
+    return refuse(path, KIND, f"is busy ({who})", way_out)
+
+
+def _programs(path: Path, *, writing: bool) -> list[str]:
+    """Name the processes that have a file open (for writing), as far as this system tells (Linux does)."""
+    try:
+        wanted = path.stat()
+        processes = [entry for entry in os.scandir("/proc") if entry.name.isdigit()]
+    except OSError:
+        return []
+    return [_name(int(entry.name)) for entry in processes if _holds(Path(entry.path), wanted, writing=writing)]
+
+
+def _holds(process: Path, wanted: os.stat_result, *, writing: bool) -> bool:
+    try:
+        handles = list((process / "fd").iterdir())
+    except OSError:  # ended meanwhile, or another user's
+        return False
+    for handle in handles:
+        try:
+            if os.path.samestat(handle.stat(), wanted) and (not writing or _writes(process / "fdinfo" / handle.name)):
+                return True
+        except OSError:
+            continue
+    return False
+
+
+def _writes(facts: Path) -> bool:
+    flags = next(line for line in facts.read_text().splitlines() if line.startswith("flags:"))
+    return int(flags.split()[1], 8) & os.O_ACCMODE != os.O_RDONLY
+
+
+def _name(process: int) -> str:
+    if process == os.getpid():
+        return "this program itself"
+    try:
+        return f"{Path(f'/proc/{process}/comm').read_text().strip()} (process {process})"
+    except OSError:
+        return f"process {process}"
