@@ -26,7 +26,6 @@ def _run(words: list[str]) -> int:
 def _render(config: Mapping[str, Any]) -> None:
     import torch
 
-
     from vpd_lightning.editing.colored_editor import colored_editor
     from vpd_lightning.editing.edit_files import load_edit, replay
     from vpd_lightning.errors import OutOfMemoryError

@@ -7,8 +7,7 @@ from typing import Any
 import torch
 import yaml
 
-from vpd_lightning.data.manifest import Manifest
-from vpd_lightning.data.manifest import DATA_SHA256
+from vpd_lightning.data.manifest import DATA_SHA256, Manifest
 from vpd_lightning.errors import ConfigError, OutOfMemoryError
 from vpd_lightning.evaluation.evaluate import Evaluation, evaluate
 from vpd_lightning.evaluation.prediction import PredictsVideo, PredictsViews
