@@ -68,7 +68,7 @@ view: $(STAMP) ## Open the browser viewer on a trained model (VIEW_MODEL=release
 EDIT_DATA ?= datasets/deformable_collision_tiny
 editing-figure: $(STAMP) ## Draw the paper's editing figure: no ball, no cube, no floor (needs GL; half a minute)
 	$(BIN)/vpd-data generate scene=deformable_collision preset=tiny out=$(EDIT_DATA) seed=0
-	$(BIN)/python -m benchmarks.editing_figure released/deformable_collision_inertial --data $(EDIT_DATA) --start 8 --out $(call NEW_FOLDER,runs/editing_figure)
+	$(BIN)/python -m docs.results.studies.editing_figure released/deformable_collision_inertial --data $(EDIT_DATA) --start 8 --out $(call NEW_FOLDER,runs/editing_figure)
 
 novel-view-figure: $(STAMP) ## Draw the paper's novel-view figure: a ring of cameras after 15 steps
 	$(BIN)/vpd-data generate scene=deformable_collision preset=tiny out=$(EDIT_DATA) seed=0

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from benchmarks import stages
 from benchmarks.measuring import Stopwatch, replaced
+from benchmarks.plain.literal import LiteralVPD
 from benchmarks.plain.simulator import plain
 from benchmarks.worlds import video_batch
 from vpd_lightning.dynamics import hierarchical_gnn
@@ -17,6 +18,11 @@ from vpd_lightning.losses.pixel import PixelLoss
 from vpd_lightning.simulator import Simulator
 from vpd_lightning.types import VideoBatch
 
+_LITERAL_DYNAMICS = {"hidden": "hidden_dim", "num_rounds": "message_passing_steps", "r_s": "r_s", "r_a_s": "r_a_s"}
+_LITERAL_RENDERER = {
+    "num_coarse": "num_coarse_samples", "num_fine": "num_fine_samples", "field_width": "net_width",
+    "condition_width": "net_width_condition", "num_neighbors": "num_neighbors",
+}  # fmt: skip
 STAGES = ("encode", "graph", "dynamics", "render", "loss", "backward", "optimiser")
 
 
@@ -45,6 +51,35 @@ TINY = Scale(
 )  # fmt: skip
 
 EDGES_PER_NODE = 256  # room for edges among abstract nodes where shapes are fixed; surfaces have 90 to 160
+
+
+class LiteralStep:
+    """A training step of ``plain.literal`` on the input of ``Step``; only its time and its memory can be compared."""
+
+    def __init__(self, scale: Scale, device: torch.device) -> None:
+        torch.manual_seed(0)
+        self.device = device
+        dynamics, renderer = scale.dynamics or {}, scale.renderer or {}
+        given = {name: dynamics[key] for name, key in _LITERAL_DYNAMICS.items() if key in dynamics}
+        given |= {name: renderer[key] for name, key in _LITERAL_RENDERER.items() if key in renderer}
+        widths = stages.section(f"encoder/{scale.encoder}")["channels"][:-1]
+        self.model = LiteralVPD((*widths, 16), scale.particles, scale.abstract_nodes, **given).to(device).train()
+        self.batch: VideoBatch = video_batch(scale.image, scale.steps, scale.rays).to(device)
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=0.0)
+        self.last_loss = float("nan")
+
+    def __call__(self, watch: Stopwatch | None = None) -> Tensor:
+        """Take the step; return all gradients in one vector."""
+        watch = watch or Stopwatch(self.device)
+        self.optimizer.zero_grad(set_to_none=True)
+        with watch.stage("forward"):
+            loss = self.model(self.batch)
+        with watch.stage("backward"):
+            loss.backward()
+        with watch.stage("optimiser"):
+            self.optimizer.step()
+        self.last_loss = float(loss.detach())
+        return torch.cat([p.grad.flatten() for p in self.model.parameters() if p.grad is not None]).double()
 
 
 class Step:

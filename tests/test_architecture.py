@@ -12,7 +12,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-OUR_CODE = sorted([*ROOT.glob("src/**/*.py"), *ROOT.glob("data_gen/**/*.py"), *ROOT.glob("benchmarks/**/*.py")])
+OUR_CODE = sorted(
+    path for folder in ("src", "data_gen", "benchmarks", "docs") for path in ROOT.glob(f"{folder}/**/*.py")
+)
 OUR_TESTS = sorted(ROOT.glob("tests/**/*.py"))
 STAGES = ("encoder", "dynamics", "renderer", "losses")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}"}

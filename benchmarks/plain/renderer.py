@@ -1,4 +1,4 @@
-"""The paper's renderer written plainly: every [sample, neighbour, kernel, feature] product in memory, no reuse."""
+"""The paper's renderer written plainly: neighbours gathered for each sample, kernels summed by ``einsum``, no reuse."""
 
 import torch
 from torch import Tensor
@@ -77,8 +77,8 @@ def _features(
         for values in (model.kernel_radii, model.kernel_bandwidths)
     )
     kernels = torch.exp(-(((distance[..., None] - radii) / bandwidths) ** 2))
-    dense = kernels[..., None] * features[index][:, :, None, :]  # query, neighbour, kernel, feature
-    return dense.sum(dim=1).flatten(1).unflatten(0, t.shape)
+    summed = torch.einsum("qnk,qnf->qkf", kernels, features[index])  # query, neighbour, kernel, feature
+    return summed.flatten(1).unflatten(0, t.shape)
 
 
 def _field(net: RadianceField, features: Tensor, directions: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -30,7 +30,6 @@ WINDOW = 8  # frames
 STORAGES = {
     "gzip": {"compression": "gzip", "depth_encoding": "float32"},
     "gzip, 16-bit depth": {"compression": "gzip", "depth_encoding": "uint16"},
-    "lzf": {"compression": "lzf", "depth_encoding": "float32"},
     "uncompressed": {"compression": "none", "depth_encoding": "float32"},
 }
 LOADERS = [(workers, cache) for workers in (0, 2) for cache in (True, False)]
@@ -80,7 +79,7 @@ def reading(folder: Path, options: Options) -> list[Row]:
             _require_equal(_window(readers[0], 3, views), _image_by_image(files[0], 3, views), storage)
         note = f"{WINDOW} frames x {len(views)} views of {size}x{size}, colour and depth; wall time, median of {count}"
         rows.append(row(f"read/{storage}", seconds["read"], "image by image", seconds["image by image"], note=note))
-        if storage in ("gzip", "lzf"):
+        if storage == "gzip":
             rows.append(row(f"open and read/{storage}", seconds["open and read"], note=note))
     return rows
 

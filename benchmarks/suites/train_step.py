@@ -10,15 +10,17 @@ from benchmarks.arithmetic import TRAINING, Work, dynamics_layers, edge_counts, 
 from benchmarks.measuring import Options, Result, Row, Stopwatch, copy_rate, device_peak, gemm_rate, row
 from benchmarks.memory_probe import peak_of
 from benchmarks.plain.neighbors import SEARCH
-from benchmarks.training_step import SCALES, STAGES, Step
+from benchmarks.training_step import SCALES, STAGES, LiteralStep, Step
 
 VARIANTS = ("plain", "fast", "saving", "bf16", "surface", "surface_bf16")
+LITERAL = "literal"
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4  # relative; float32 sums in another order
 NOTES = {
     "fast": "exact tricks alone",
     "saving": "activations computed again in the backward pass",
     "bf16": "autocast to bfloat16; not the same numbers",
     "surface": "another renderer: another loss, so no error",
+    LITERAL: "the paper in PyTorch without this package: other weights and draws, so no error",
     "surface_bf16": "another renderer, autocast to bfloat16: another loss, so no error",
 }
 
@@ -31,10 +33,11 @@ def run(options: Options) -> Result:
     """
     scale = SCALES[options.size]
     steps = {variant: Step(variant, scale, options.device) for variant in VARIANTS}
-    seconds: dict[str, dict[str, list[float]]] = {variant: defaultdict(list) for variant in VARIANTS}
+    together = {**steps, LITERAL: LiteralStep(scale, options.device)}
+    seconds: dict[str, dict[str, list[float]]] = {variant: defaultdict(list) for variant in together}
     gradients: dict[str, Tensor] = {}
     for repeat in range(options.repeats + 1):  # the first round warms up
-        for variant, step in steps.items():
+        for variant, step in together.items():
             watch = Stopwatch(options.device)
             gradients[variant] = step(watch)
             if repeat:
@@ -58,6 +61,10 @@ def run(options: Options) -> Result:
                 raise AssertionError(f"{variant} disagrees with plain: gradients {error:.1e}, loss {loss_error:.1e}")
         here, there = seconds[variant]["step"], seconds["plain"]["step"]
         rows.append(row(f"train_step/{variant}", here, "plain", there, error, None, peaks[variant], note))
+    literal = seconds[LITERAL]["step"]
+    rows.append(row(f"train_step/{LITERAL}", literal, "plain", seconds["plain"]["step"], note=NOTES[LITERAL]))
+    for variant in VARIANTS:
+        rows.append(row(f"against literal/{variant}", seconds[variant]["step"], LITERAL, literal))
     for stage in (*STAGES, "other"):
         here, there = seconds["fast"][stage], seconds["plain"][stage]
         if max(here) > 0:  # on the plain path the graph is part of the dynamics

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from data_gen.importers.lens import undistort
 from vpd_lightning.errors import DataError
@@ -50,14 +51,8 @@ def rotation_from_quaternion(quaternion: ArrayLike, order: str = "wxyz") -> Arra
     if order not in ("wxyz", "xyzw"):
         raise ValueError(f"order is {order!r}; allowed: wxyz, xyzw")
     values = np.asarray(quaternion, np.float64)
-    values = values / np.linalg.norm(values, axis=-1, keepdims=True)
-    w, x, y, z = np.moveaxis(values if order == "wxyz" else np.roll(values, 1, axis=-1), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    rotations = Rotation.from_quat(values.reshape(-1, 4), scalar_first=order == "wxyz")
+    return rotations.as_matrix().reshape(*values.shape[:-1], 3, 3)
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:

@@ -67,7 +67,3 @@ class Recording:
     def intrinsics_at(self, frame: int) -> NDArray[np.float64]:
         """Return (view, 3, 3) of one frame."""
         return self.intrinsics if self.intrinsics.ndim == 3 else self.intrinsics[frame]
-
-    def cam_to_world_at(self, frame: int) -> NDArray[np.float64]:
-        """Return (view, 4, 4) of one frame."""
-        return self.cam_to_world if self.cam_to_world.ndim == 3 else self.cam_to_world[frame]

@@ -1,7 +1,7 @@
 """Settings of ``vpd-data import``: what may be given, with which defaults, and what each value may be."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -123,17 +123,6 @@ def load_import_settings(overrides: Mapping[str, Any]) -> ImportSettings:
     """
     base = OmegaConf.create(asdict(ImportSettings()))
     return checked_settings(ImportSettings, base, overrides, "import")
-
-
-def setting_names() -> list[str]:
-    """Return all settings by dotted name."""
-    names = []
-    for item in fields(ImportSettings):
-        if is_dataclass(item.type):
-            names += [f"{item.name}.{inner.name}" for inner in fields(item.type)]
-        else:
-            names.append(item.name)
-    return names
 
 
 def _at_least(value: int | None, lowest: int) -> bool:

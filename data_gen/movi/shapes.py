@@ -19,7 +19,6 @@ from data_gen.movi.sweeps import pierced_prism, revolution, tube, voxel_mesh
 SHAPES = (
     "cube", "cylinder", "sphere", "cone", "torus", "gear", "torus_knot", "sponge", "spot", "teapot", "suzanne",
 )  # fmt: skip
-STAND_IN_SHAPES = ("spot", "teapot", "suzanne")
 
 _SECTIONS = 48  # corners of the circles of cylinder and cone; a multiple of 4 keeps the bounding box exact
 _TORUS_RADIUS, _TORUS_TUBE = 0.375, 0.125

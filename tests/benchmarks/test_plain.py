@@ -11,6 +11,7 @@ from benchmarks import stages
 from benchmarks.arithmetic import dynamics_layers, edge_counts, encoder_layers, renderer_layers, work
 from benchmarks.plain import dynamics as plain_dynamics
 from benchmarks.plain import renderer as plain_renderer
+from benchmarks.plain.literal import LiteralVPD
 from benchmarks.plain.simulator import plain
 from benchmarks.worlds import picture_rays, surface_particles, two_frames, video_batch
 from vpd_lightning.losses.pixel import PixelLoss
@@ -87,12 +88,34 @@ def test_operations_counted_from_shapes_are_those_of_the_plain_path():
             encoder.network(torch.zeros(2, 3, 32, 32))
 
     counts = edge_counts(dynamics, previous, current)
+    # The counter takes the sums over neighbours for products of matrices; those are not layers.
+    num_samples = 10 * (2 * renderer.num_coarse_samples + renderer.num_fine_samples)
+    kernel_sums = 2 * num_samples * renderer.num_neighbors * len(renderer.kernel_radii) * particles.features.shape[-1]
     expected = [
         work(dynamics_layers(dynamics, counts, is_plain=True)).operations,
-        work(renderer_layers(renderer, 10, is_plain=True)).operations,
+        work(renderer_layers(renderer, 10, is_plain=True)).operations + kernel_sums,
         work(encoder_layers(encoder, 32, 32, 2)).operations,
     ]
 
     assert [counter.get_total_flops() for counter in counters] == expected
     assert work(dynamics_layers(dynamics, counts)).operations < expected[0]
-    assert work(renderer_layers(renderer, 10)).operations < expected[1]
+    assert work(renderer_layers(renderer, 10)).operations < expected[1] - kernel_sums
+
+
+def test_the_literal_vpd_has_the_networks_of_the_paper_and_learns_in_all_of_them():
+    sizes = {"num_particles": 64, "num_nodes": 8, "num_coarse": 8, "num_fine": 8, "num_neighbors": 4}
+    ours = stages.build_simulator(
+        "mujoco", ("unet", {}), ("hierarchical_gnn", {}), ("point_nerf", {}), checkpoint_dynamics=False,
+        pixel_gradient_to_motion=1.0,
+    )  # fmt: skip
+    torch.manual_seed(0)
+    literal = LiteralVPD(**sizes, r_s=0.5, r_a_s=1.0)
+    for name in ("encoder", "dynamics", "renderer"):
+        counts = [sum(p.numel() for p in getattr(model, name).parameters()) for model in (ours, literal)]
+        assert counts[0] == counts[1], name
+
+    loss = literal(video_batch(32, 2, 8))
+    loss.backward()
+
+    assert loss.isfinite() and loss > 0
+    assert all(parameter.grad is not None and parameter.grad.isfinite().all() for parameter in literal.parameters())

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from vpd_lightning.data.hdf5.image_chunks import ImageChunks
-from vpd_lightning.data.hdf5.lzf_numba import SLACK, fletcher32, unpack_lzf
+from vpd_lightning.data.hdf5.stored_chunks import lzf_size
 from vpd_lightning.errors import DataError
 
 SHAPE = (3, 2, 24, 20)
@@ -86,25 +86,26 @@ def test_image_that_was_stored_unpacked_is_read(tmp_path: Path):
         )
 
 
-def test_nothing_is_written_beyond_the_slack():
-    """Random bytes as lzf: whatever they say, the guard behind the slack stays as it was."""
-    draw = np.random.default_rng(0)
-    for _ in range(300):
-        source = draw.integers(0, 256, size=200 + SLACK).astype(np.uint8)
-        target = np.full(480 + SLACK + 8, 77, np.uint8)
-        assert unpack_lzf(source, 200, target, 480) <= 480
-        assert (target[480 + 8 :] == 77).all()
+@pytest.mark.parametrize("kind", ["noise", "flat", "runs"])
+def test_the_size_of_what_lzf_packed_is_known_without_unpacking(tmp_path: Path, kind: str):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        dataset = file.create_dataset("x", data=pictures(kind, "u1"), chunks=(1, 1, 24, 20), compression="lzf")
+        for place in np.ndindex(SHAPE[:2]):
+            skipped, packed = dataset.id.read_direct_chunk((*place, 0, 0))
+            assert skipped or lzf_size(packed) == 24 * 20
+            assert skipped == (kind == "noise")
 
 
-def test_checksum_is_that_of_a_plain_loop():
-    for num_bytes in (0, 1, 2, 15, 50_001):
-        content = np.random.default_rng(num_bytes).integers(0, 256, size=num_bytes).astype(np.uint8)
-        first = second = 0
-        padded = content.tolist() + [0] * (num_bytes % 2)
-        for high, low in zip(padded[::2], padded[1::2], strict=True):
-            first = (first + 256 * high + low) % 65_535
-            second = (second + first) % 65_535
-        assert fletcher32(content, num_bytes) == second << 16 | first
+def test_a_checksum_that_does_not_fit_is_noticed_however_a_chunk_is_packed(tmp_path: Path):
+    for number, options in enumerate(({"compression": "lzf"}, {"compression": "gzip"}, {})):
+        with h5py.File(tmp_path / f"{number}.h5", "w") as file:
+            dataset = file.create_dataset(
+                "x", data=pictures("flat", "u1"), chunks=(1, 1, 24, 20), fletcher32=True, **options
+            )
+            _, packed = dataset.id.read_direct_chunk((0, 0, 0, 0))
+            dataset.id.write_direct_chunk((0, 0, 0, 0), bytes([packed[0], packed[1] ^ 1]) + packed[2:])
+        with h5py.File(tmp_path / f"{number}.h5") as file, pytest.raises(DataError, match="'/x'"):
+            ImageChunks(tmp_path / f"{number}.h5", file["x"]).read(np.array([0]), np.array([0]))
 
 
 @pytest.mark.parametrize("options", [{"compression": "gzip"}, {"compression": "lzf"}, {}, {"fletcher32": True}])

@@ -12,7 +12,7 @@ from tests.data_gen.blocks import small_scene
 from vpd_lightning.data.ground_truth import GroundTruth
 from vpd_lightning.data.schema import Trajectory
 from vpd_lightning.errors import ConfigError
-from vpd_lightning.metrics.rigid_motion import rotation_matrix
+from vpd_lightning.geometry.rotations import rotation_matrix
 
 VIEW_SIZE = {"camera.height": 48, "camera.width": 64}
 TOLERANCE = 1e-4  # m; the bound. Float32 depth alone is good to 5e-7 m at 8 m

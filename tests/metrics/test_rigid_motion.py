@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from vpd_lightning.geometry.rotations import rotation_matrix
 from vpd_lightning.metrics.rigid_motion import (
     centroid_error,
     inside_box,
@@ -12,7 +13,6 @@ from vpd_lightning.metrics.rigid_motion import (
     particle_error,
     rigidity_error,
     rms_radius,
-    rotation_matrix,
 )
 
 

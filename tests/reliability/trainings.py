@@ -89,18 +89,19 @@ def differences(a: Path, b: Path) -> list[str]:
     for loaded in (first, second):
         loaded["callbacks"].pop("TimeBudget", None)  # how long it took
     for part in ("state_dict", "optimizer_states", "lr_schedulers", "callbacks", "loops", "global_step"):
-        if not _equal(first[part], second[part]):
+        if not is_equal(first[part], second[part]):
             found.append(part)
     if metrics(a) != metrics(b):
         found.append("metrics.csv")
     return found
 
 
-def _equal(a: Any, b: Any) -> bool:
+def is_equal(a: Any, b: Any) -> bool:
+    """Whether plain containers hold the same, tensors bit for bit."""
     if isinstance(a, torch.Tensor):
         return isinstance(b, torch.Tensor) and a.dtype == b.dtype and torch.equal(a, b)
     if isinstance(a, dict):
-        return isinstance(b, dict) and a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
+        return isinstance(b, dict) and a.keys() == b.keys() and all(is_equal(a[key], b[key]) for key in a)
     if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(_equal(x, y) for x, y in zip(a, b, strict=True))
+        return len(a) == len(b) and all(is_equal(x, y) for x, y in zip(a, b, strict=True))
     return bool(a == b)

@@ -5,7 +5,8 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from benchmarks.plain.splat import splat_candidates, splat_picture
+from benchmarks.plain.splat import splat_candidates
+from tests.reference.reference_splat import splat_picture
 from vpd_lightning.config import build
 from vpd_lightning.config.migrations import upgraded
 from vpd_lightning.errors import NonFiniteError

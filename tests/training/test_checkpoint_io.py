@@ -1,15 +1,20 @@
 """Checkpoints: whole or not there, verified, and nothing in them can run."""
 
+import hashlib
 import multiprocessing
 import os
 import pickle
+import re
 import signal
+import struct
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from lightning.pytorch import LightningModule, Trainer
+from torch.utils.data import DataLoader
 
 from vpd_lightning.config.pretraining import FOLDER
 from vpd_lightning.errors import CheckpointError
@@ -36,15 +41,43 @@ def test_what_is_written_is_read_and_plain_torch_reads_it_too(tmp_path: Path) ->
     assert [item.name for item in path.parent.iterdir()] == ["a.ckpt"]
 
 
-def test_every_changed_byte_is_noticed(tmp_path: Path) -> None:
+def payloads(path: Path) -> set[int]:
+    """Places of the bytes that are content; the others are the archive's headers, and gaps between its members."""
+    found: set[int] = set()
+    with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
+        for member in archive.infolist():
+            stream.seek(member.header_offset + 26)
+            name_length, extra_length = struct.unpack("<HH", stream.read(4))
+            start = member.header_offset + 30 + name_length + extra_length
+            found |= set(range(start, start + member.file_size))
+    return found
+
+
+def signatures(archive: bytes, start: int) -> list[int]:
+    """Places where an entry of the archive's directory begins."""
+    return [place for place in range(start, len(archive)) if archive[place : place + 4] == b"PK\x01\x02"]
+
+
+def test_a_changed_byte_is_noticed_or_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     write_checkpoint(content(), path)
-    good = path.read_bytes()
-    places = sorted({*range(0, len(good), 37), *range(len(good) - 100, len(good))})
-    for place in places:
-        path.write_bytes(good[:place] + bytes([good[place] ^ 0x40]) + good[place + 1 :])
-        with pytest.raises(CheckpointError, match="damaged|cut short|not a checkpoint"):
-            load_checkpoint(path)
+    good, inside = path.read_bytes(), payloads(path)
+    with zipfile.ZipFile(path) as archive:
+        attributes = [place + 38 for place in signatures(good, archive.start_dir)]
+    refused = 0
+    changes = [(place, 0x40) for place in sorted({*range(0, len(good), 37), *range(len(good) - 100, len(good))})]
+    for place, changed_bits in [*changes, *((place, 0x10) for place in attributes)]:  # 0x10: as if it were a folder
+        path.write_bytes(good[:place] + bytes([good[place] ^ changed_bits]) + good[place + 1 :])
+        try:
+            loaded = load_checkpoint(path)
+        except CheckpointError as error:
+            assert re.search("damaged|not a checkpoint", str(error))
+            refused += 1
+            continue
+        assert place not in inside
+        assert torch.equal(loaded["state_dict"]["weight"], content()["state_dict"]["weight"])
+        assert loaded["hyper_parameters"] == content()["hyper_parameters"]
+    assert refused > len(inside & {place for place, _ in changes}) + len(attributes)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
@@ -53,8 +86,40 @@ def test_a_file_that_is_cut_short_is_refused(tmp_path: Path, share: float) -> No
     write_checkpoint(content(), path)
     good = path.read_bytes()
     path.write_bytes(good[: int(share * len(good))])
-    with pytest.raises(CheckpointError, match="does not end in our checksum"):
+    with pytest.raises(CheckpointError, match="is damaged or cut short|is not a checkpoint"):
         load_checkpoint(path)
+
+
+def test_checkpoints_with_the_checksum_of_older_versions_are_read(tmp_path: Path) -> None:
+    """They end in the SHA-256 of what is before it, as the comment of the archive."""
+    path = tmp_path / "a.ckpt"
+    write_checkpoint(content(2.0), path)
+    trailer = b"vpd-sha256:" + hashlib.sha256(path.read_bytes()[:-2]).hexdigest().encode()
+    path.write_bytes(path.read_bytes()[:-2] + len(trailer).to_bytes(2, "little") + trailer)
+    assert value_of(path) == 2.0
+
+
+def test_checkpoints_of_plain_lightning_are_read(tmp_path: Path) -> None:
+    class Module(LightningModule):
+        def __init__(self) -> None:
+            super().__init__()
+            self.save_hyperparameters({"experiment": "test"})
+            self.weight = torch.nn.Parameter(torch.full((100,), 3.0))
+
+        def training_step(self, batch: torch.Tensor, batch_idx: int) -> torch.Tensor:
+            return (self.weight * batch).sum()
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters(), lr=0.0)
+
+    trainer = Trainer(
+        max_steps=1, accelerator="cpu", default_root_dir=tmp_path, logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(Module(), DataLoader(torch.ones(1, 1)))
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+    loaded = load_checkpoint(tmp_path / "a.ckpt")
+    assert float(loaded["state_dict"]["weight"][0]) == 3.0 and loaded["hyper_parameters"] == {"experiment": "test"}
 
 
 def test_files_that_are_not_ours_are_refused(tmp_path: Path) -> None:
@@ -62,8 +127,12 @@ def test_files_that_are_not_ours_are_refused(tmp_path: Path) -> None:
     path.write_text("hello")
     with pytest.raises(CheckpointError, match="is not a checkpoint"):
         load_checkpoint(path)
-    torch.save(content(), path)
-    with pytest.raises(CheckpointError, match="another program wrote it"):
+    torch.save(content(), path, _use_new_zipfile_serialization=False)
+    with pytest.raises(CheckpointError, match="is not a checkpoint"):
+        load_checkpoint(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("hello.txt", "hello")
+    with pytest.raises(CheckpointError, match="not a checkpoint"):
         load_checkpoint(path)
     write_checkpoint({"weights": torch.ones(1)}, path)
     with pytest.raises(CheckpointError, match="holds no weights"):

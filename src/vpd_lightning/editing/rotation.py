@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vpd_lightning.errors import EditError
+from vpd_lightning.geometry.rotations import rotation_matrix
 
 Numbers: TypeAlias = Any
 """One number or several as a caller or a file gives them; a constructor checks them and keeps a plain tuple."""
 
 Quaternion = tuple[float, float, float, float]
-Vector = tuple[float, float, float]
 
 NO_ROTATION: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
@@ -68,15 +68,7 @@ def about_axis(axis: Sequence[float], degrees: float) -> Quaternion:
 
 def matrix_of(quaternion: Quaternion) -> Float[Tensor, "3 3"]:
     """Return the rotation matrix (float64) of a unit quaternion."""
-    w, x, y, z = quaternion
-    return torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
+    return rotation_matrix(torch.tensor(quaternion, dtype=torch.float64))
 
 
 def _from_matrix(matrix: Tensor, name: str) -> Quaternion:

@@ -13,8 +13,6 @@ from vpd_lightning.errors import EditError
 from vpd_lightning.simulator import Scene
 from vpd_lightning.types import Particles
 
-OPTIONAL_FIELDS = ("colors", "moving", "normals")
-
 
 @dataclass(frozen=True)
 class EditState:

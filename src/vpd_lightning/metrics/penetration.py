@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vpd_lightning.metrics.rigid_motion import rotation_matrix
+from vpd_lightning.geometry.rotations import rotation_matrix
 
 
 def below_floor(points: Float[Tensor, "*shape particle 3"], height: float) -> Float[Tensor, "*shape particle"]:

@@ -4,18 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vpd_lightning.geometry.rotations import rotation_matrix
 from vpd_lightning.metrics.body_dynamics import best_rotation
-
-
-def rotation_matrix(quaternion: Float[Tensor, "*shape 4"]) -> Float[Tensor, "*shape 3 3"]:
-    """Rotation matrix of a quaternion (w x y z), normalised first."""
-    w, x, y, z = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def to_body_frame(points: Float[Tensor, "particle 3"], pose: Float[Tensor, " 7"]) -> Float[Tensor, "particle 3"]:

@@ -1,12 +1,13 @@
-"""Checkpoints that are whole or not there: written aside, flushed, renamed, and read only if their checksum holds."""
+"""Checkpoints that are whole or not there: written aside, flushed, renamed, and read only if all checksums hold."""
 
 import hashlib
 import io
 import os
 import pickle
 import re
-import tempfile
+import struct
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,13 @@ from typing import Any
 import torch
 
 from vpd_lightning.errors import CheckpointError
+from vpd_lightning.files import PARTIAL_SUFFIX, AtomicPath
 
 LAST = "last.ckpt"
 PREVIOUS = "last-previous.ckpt"
 BEST = "best.ckpt"
 
-# The checksum is the comment of the zip archive that a checkpoint is: one file, one rename, and still a zip archive.
-_MARK = b"vpd-sha256:"
-_TRAILER_LENGTH = len(_MARK) + 64
-_PARTIAL_SUFFIX = ".partial"
+_IS_FOLDER = 0x10  # of MS-DOS file attributes, which PyTorch's reader looks at
 _ADDRESS = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
@@ -39,30 +38,15 @@ def write_checkpoint(content: dict[str, Any], path: Path) -> None:
     """Write ``path`` so that at every moment it is either absent, the old file, or the complete new file."""
     buffer = io.BytesIO()
     torch.save(content, buffer)
-    archive = buffer.getbuffer()
-    body, comment_length = archive[:-2], bytes(archive[-2:])
-    if comment_length != b"\0\0":
-        raise CheckpointError(f"{path}: torch.save wrote an archive that has a comment already; nothing was written.")
-    trailer = _MARK + hashlib.sha256(body).hexdigest().encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    # In the same folder: a rename across file systems would be a copy, which can be cut short.
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PARTIAL_SUFFIX)
     try:
-        with os.fdopen(handle, "wb") as stream:
-            for part in (body, len(trailer).to_bytes(2, "little"), trailer):
-                stream.write(part)
-            stream.flush()
-            os.fchmod(stream.fileno(), 0o644)
-            os.fsync(stream.fileno())
-        os.replace(name, path)
+        with AtomicPath(path) as partial:
+            partial.write_bytes(buffer.getbuffer())
     except OSError as error:
         raise CheckpointError(
             f"{path} could not be written: {error.strerror or error}.\n"
             "The checkpoint before it is still whole. Make room or permit writing, then go on with resume=last."
         ) from error
-    finally:
-        Path(name).unlink(missing_ok=True)
-    _flush_folder(path.parent)
 
 
 def load_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
@@ -71,9 +55,9 @@ def load_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
 
 
 def open_checkpoint(path: str | Path, map_location: Any = "cpu") -> OpenedCheckpoint:
-    """Read a checkpoint of ours: checksum first, then plain tensors and containers only (nothing in it can run).
+    """Read a checkpoint: checksums first, then plain tensors and containers only (nothing in it can run).
 
-    Raises CheckpointError where the file is missing, damaged, not ours, without weights, or an internet address.
+    Raises CheckpointError where the file is missing, damaged, not a checkpoint, without weights, or on the internet.
     """
     loaded, sha256 = _read(path, map_location)
     if not isinstance(loaded, dict) or "state_dict" not in loaded:
@@ -92,48 +76,55 @@ def _read(path: str | Path, map_location: Any) -> tuple[Any, str]:
         raise CheckpointError(f"{path} is an internet address.\nFetch the file first, then give its path.")
     path = Path(path)
     try:
-        content = path.read_bytes()
+        content = io.BytesIO(path.read_bytes())
     except FileNotFoundError:
         raise CheckpointError(
             f"There is no checkpoint {path}.\nCheck the path; runs keep theirs in checkpoints/."
         ) from None
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror or error}.") from error
-    trailer = content[-_TRAILER_LENGTH:]
-    if not trailer.startswith(_MARK):
-        what = "is cut short, or another program wrote it" if content[:2] == b"PK" else "is not a checkpoint"
-        raise CheckpointError(f"{path} {what}: it does not end in our checksum.\nUse another checkpoint of the run.")
-    body = memoryview(content)[: -_TRAILER_LENGTH - 2]
-    length_fits = content[-_TRAILER_LENGTH - 2 : -_TRAILER_LENGTH] == _TRAILER_LENGTH.to_bytes(2, "little")
-    digest = hashlib.sha256(body)
-    if not length_fits or digest.hexdigest().encode() != trailer[len(_MARK) :]:
-        raise CheckpointError(f"{path} is damaged: its checksum does not fit.\nUse another checkpoint of the run.")
+    _require_whole(path, content)
     try:
-        loaded = torch.load(io.BytesIO(content), map_location=map_location, weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, zipfile.BadZipFile, EOFError, ValueError) as error:
+        loaded = torch.load(content, map_location=map_location, weights_only=True)
+    except pickle.UnpicklingError as error:
         raise CheckpointError(
             f"{path} holds more than tensors and plain containers, and is not opened.\n{str(error).splitlines()[0]}"
         ) from error
-    digest.update(content[len(body) :])
-    return loaded, digest.hexdigest()
+    except (RuntimeError, EOFError, ValueError) as error:  # PyTorch's reader is stricter about headers than zipfile
+        raise CheckpointError(
+            f"{path} is damaged, or not a checkpoint: {str(error).splitlines()[0]}\nUse another checkpoint of the run."
+        ) from error
+    return loaded, hashlib.sha256(content.getbuffer()).hexdigest()
+
+
+def _require_whole(path: Path, content: io.BytesIO) -> None:
+    """Check the CRC-32 of every member of the zip archive that ``torch.save`` writes; ``torch.load`` checks none."""
+    if content.getbuffer()[:2] != b"PK":
+        raise CheckpointError(f"{path} is not a checkpoint.\nUse one that vpd-train wrote.")
+    try:
+        with zipfile.ZipFile(content) as archive:
+            broken = archive.testzip()
+            # A member marked as a folder is not read by torch.load, which returns uninitialised memory in its place.
+            folders = [member.filename for member in archive.infolist() if member.external_attr & _IS_FOLDER]
+            broken = broken or next(iter(folders), None)
+    # zipfile raises all of these where headers are damaged; RuntimeError is for what looks encrypted.
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, struct.error) as error:
+        broken = str(error)
+    if broken is not None:
+        raise CheckpointError(
+            f"{path} is damaged or cut short: its checksums do not fit ({broken}).\nUse another checkpoint of the run."
+        )
+    content.seek(0)
 
 
 def keep_previous(last: Path) -> None:
     """Give the present ``last.ckpt`` a second name, under which it survives its replacement."""
     if not last.is_file():
         return
-    aside = last.with_name(f".{PREVIOUS}{_PARTIAL_SUFFIX}")
+    aside = last.with_name(f".{PREVIOUS}{PARTIAL_SUFFIX}")
     aside.unlink(missing_ok=True)
     try:
         os.link(last, aside)
         os.replace(aside, last.with_name(PREVIOUS))
     except OSError:  # a file system without hard links: for a moment only the previous one is there
         os.replace(last, last.with_name(PREVIOUS))
-
-
-def _flush_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -1,14 +1,14 @@
 """``metrics.csv``: a row per logged step, on disk when the step ends, and without gaps or repeats after a resume."""
 
 import csv
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from lightning.pytorch.loggers.logger import Logger, rank_zero_experiment
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
+
+from vpd_lightning.files import AtomicPath
 
 FILE_NAME = "metrics.csv"
 
@@ -83,13 +83,10 @@ class MetricsCSV(Logger):
     def _write(self, columns: list[str], rows: list[dict[str, str]]) -> None:
         """Replace the file in one move."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=self.path.parent, prefix=f".{FILE_NAME}.", suffix=".partial")
-        with os.fdopen(handle, "w", newline="") as stream:
+        with AtomicPath(self.path) as partial, partial.open("w", newline="") as stream:
             writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
-            os.fchmod(stream.fileno(), 0o644)
-        os.replace(name, self.path)
         self._columns = columns
 
 

@@ -46,7 +46,7 @@ def largest_surface_distance(recording: Recording, times: list[float]) -> float:
             depth = recording.read_depth(frame, view)
             assert depth.dtype == np.float32 and depth.shape == (recording.height, recording.width)
             assert (depth > 0).mean() > 0.9
-            intrinsics, cam_to_world = recording.intrinsics_at(frame)[view], recording.cam_to_world_at(frame)[view]
+            intrinsics, cam_to_world = recording.intrinsics_at(frame)[view], recording.cam_to_world[frame][view]
             worst = max(worst, float(distance_to_surfaces(unproject(depth, intrinsics, cam_to_world), time).max()))
     return worst
 

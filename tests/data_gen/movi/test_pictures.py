@@ -16,7 +16,7 @@ from tests.data_gen.movi.test_settings import TRIANGLE_PYRAMID
 from tests.data_gen.test_gl import read
 from tests.data_gen.test_mujoco_block import distance_to_box
 from vpd_lightning.data.schema import Trajectory
-from vpd_lightning.metrics.rigid_motion import rotation_matrix
+from vpd_lightning.geometry.rotations import rotation_matrix
 
 TOLERANCE = 1e-4  # m; float32 depth is good to 2e-6 m at 15 m
 DOME_RADIUS = 50.0

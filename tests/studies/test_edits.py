@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.edits import Counterfactual, edited_state, surface_points
 from data_gen.deformable.drop import draw_drop
 from data_gen.deformable.settings import DeformableSettings
 from data_gen.settings import load_settings
+from docs.results.studies.edits import Counterfactual, edited_state, surface_points
 from vpd_lightning.types import Particles
 
 

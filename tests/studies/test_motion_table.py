@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from benchmarks.motion_table import main, numbers_of, read_runs, table
+from docs.results.studies.motion_table import main, numbers_of, read_runs, table
 
 
 def metrics(psnr, errors):

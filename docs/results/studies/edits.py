@@ -1,10 +1,11 @@
-"""What if a body were not there, or elsewhere? Edited rollouts against MuJoCo's own: ``python -m benchmarks.edits``.
+"""What if a body were not there, or elsewhere? Edited rollouts against MuJoCo's own.
 
-Of a test trajectory of Deformable Collision the model sees two frames just before the bodies touch. Before its rollout
-the particles of one body are taken out (``delete``) or put aside (``move``). MuJoCo goes on from the true state of the
-last input frame with the same change. The body that was left alone is judged: Chamfer-L1 distance from its particles to
-points of its surface in MuJoCo's counterfactual, over the later half of the rollout. The *unedited* rollout is held
-against the same counterfactual: an edit that the model does not take to heart would leave the two alike.
+``python -m docs.results.studies.edits``. Of a test trajectory of Deformable Collision the model sees two frames just
+before the bodies touch. Before its rollout the particles of one body are taken out (``delete``) or put aside
+(``move``). MuJoCo goes on from the true state of the last input frame with the same change. The body that was left
+alone is judged: Chamfer-L1 distance from its particles to points of its surface in MuJoCo's counterfactual, over the
+later half of the rollout. The *unedited* rollout is held against the same counterfactual: an edit that the model does
+not take to heart would leave the two alike.
 
 Which particles are the edited body's is told by the true surface, as a person would tell by a click.
 """
@@ -22,7 +23,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.results_files import default_folder, versions
+from benchmarks.results_files import versions
 from data_gen.deformable.drop import Drop, draw_drop
 from data_gen.deformable.scene import prepare
 from data_gen.deformable.settings import DeformableSettings
@@ -31,7 +32,7 @@ from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.ground_truth import read_state
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.evaluation.bodies import find_bodies
-from vpd_lightning.evaluation.prediction import encode_clip
+from vpd_lightning.evaluation.clip import encode_clip
 from vpd_lightning.loading import load_model
 from vpd_lightning.metrics.chamfer import chamfer
 from vpd_lightning.metrics.surface_distance import nearest_on_surface, surface_of
@@ -226,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--split", default="test")
     parser.add_argument("--count", type=int, default=16)
     parser.add_argument("--steps", type=int, default=16)
-    parser.add_argument("--out", type=Path, default=default_folder())
+    parser.add_argument("--out", type=Path, default=Path("runs/edits"))
     options = parser.parse_args(arguments)
 
     model = load_model(options.checkpoint)

@@ -1,4 +1,4 @@
-"""Several systems, trained over seeds, on several data sets: ``python -m benchmarks.motion_table FOLDER``.
+"""Several systems, trained over seeds, on several data sets: ``python -m docs.results.studies.motion_table FOLDER``.
 
 ``FOLDER`` holds ``EXPERIMENT/SYSTEM_SEED/evaluation/metrics.json``, as ``vpd-train`` with that ``run.folder`` and then
 ``vpd-eval`` leave them. Each cell is the mean over seeds with the least and the greatest. References are those of the

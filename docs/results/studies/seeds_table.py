@@ -1,6 +1,6 @@
 """Print a Markdown table of several evaluations of one experiment, one row per seed, and their mean.
 
-Usage: python -m benchmarks.seeds_table runs/demo/seed*/evaluation/metrics.json
+Usage: python -m docs.results.studies.seeds_table runs/demo/seed*/evaluation/metrics.json
 """
 
 import json

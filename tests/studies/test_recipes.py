@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.recipes import RECIPES, TRAINING, main
+from docs.results.studies.recipes import RECIPES, TRAINING, main
 from vpd_lightning.config import compose
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.seeds_table import COLUMNS, table
+from docs.results.studies.seeds_table import COLUMNS, table
 from tests.evaluation.conftest import protocol_with
 from tests.evaluation.tossed_box import Oracle, write_tossed_boxes
 from vpd_lightning.data.manifest import load_manifest

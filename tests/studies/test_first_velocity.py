@@ -1,6 +1,6 @@
 import torch
 
-from benchmarks.first_velocity import FOLDERS, SCENES, VARIANTS, _carried, simulator_for
+from docs.results.studies.first_velocity import FOLDERS, SCENES, VARIANTS, _carried, simulator_for
 from tests.dynamics.test_rigid_motion import rotation_about
 from vpd_lightning.config import compose
 from vpd_lightning.dynamics.inertial import InertialDynamics

@@ -1,8 +1,9 @@
 """The paper's editing figure: what happens without one body, without the other, and without the floor.
 
-``python -m benchmarks.editing_figure CHECKPOINT --data FOLDER`` rolls a scene of Deformable Collision out as it is and
-with each object-like cluster deleted, and with all that is no cluster (the scenery) deleted, and writes one picture: a
-row for each, a column for each shown step, from one camera. The edits lie beside it as YAML, for ``vpd-render edit=``.
+``python -m docs.results.studies.editing_figure CHECKPOINT --data FOLDER`` rolls a scene of Deformable Collision out as
+it is and with each object-like cluster deleted, and with all that is no cluster (the scenery) deleted, and writes one
+picture: a row for each, a column for each shown step, from one camera. The edits lie beside it as YAML, for
+``vpd-render edit=``.
 """
 
 import argparse
@@ -17,10 +18,10 @@ from vpd_lightning.editing.edit_files import save_edit
 from vpd_lightning.editing.scene_editor import SceneEditor
 from vpd_lightning.editing.selectors import AnyOf, Cluster, Everything
 from vpd_lightning.errors import ConfigError
-from vpd_lightning.files import OutputFolder
+from vpd_lightning.export.output_folder import OutputFolder
+from vpd_lightning.export.pictures import write_png
+from vpd_lightning.export.video import enlarge, framed, label_bar
 from vpd_lightning.loading import load_model
-from vpd_lightning.media.pictures import write_png
-from vpd_lightning.media.video import enlarge, framed, label_bar
 from vpd_lightning.viewer.opened_scene import OpenedScene, open_scene
 from vpd_lightning.viewer.session import to_uint8
 

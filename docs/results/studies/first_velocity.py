@@ -1,11 +1,11 @@
-"""The velocity of the first frame against the true one, on every scene: ``python -m benchmarks.first_velocity``.
+"""The velocity of the first frame against the true one, on every scene.
 
-No model is trained: two frames of RGB-D go in. *Point error* is the root mean square error of the particles' velocity
-over the root mean square of their true velocity; *centre error* is the same for the true centres of the bodies, moved
-as the particles seen of them are said to move. Particles that belong to no true body, by less than ``MARGIN``, are not
-judged; how many of those said to move are such is ``stray``, and how many particles of true bodies are said to stand
-still is ``missed``. *Zero* errs by 100 %. ``no colours`` matches places alone, ``unfinished`` leaves out the tangent
-planes, ``one body`` takes all that may move for one body.
+``python -m docs.results.studies.first_velocity``. No model is trained: two frames of RGB-D go in. *Point error* is
+the root mean square error of the particles' velocity over the root mean square of their true velocity; *centre error*
+is the same for the true centres of the bodies, moved as the particles seen of them are said to move. Particles that
+belong to no true body, by less than ``MARGIN``, are not judged; how many of those said to move are such is ``stray``,
+and how many particles of true bodies are said to stand still is ``missed``. *Zero* errs by 100 %. ``no colours``
+matches places alone, ``unfinished`` leaves out the tangent planes, ``one body`` takes all that may move for one body.
 """
 
 import argparse
@@ -20,14 +20,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.measuring import Result, Row
-from benchmarks.results_files import default_folder, write
+from benchmarks.results_files import write
 from vpd_lightning.config import build_simulator, compose
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.dynamics.inertial import InertialDynamics
-from vpd_lightning.dynamics.inertial.rigid_motion import fit_twists, rotate, rotation_from_spin
+from vpd_lightning.dynamics.rigid_motion import fit_twists, rotate, rotation_from_spin
 from vpd_lightning.evaluation.bodies import find_bodies
-from vpd_lightning.evaluation.prediction import encode_clip
+from vpd_lightning.evaluation.clip import encode_clip
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.simulator import Simulator
 
@@ -184,7 +184,7 @@ def main() -> None:
     parser.add_argument("--split", default="test")
     parser.add_argument("--count", type=int, default=16, help="trajectories")
     parser.add_argument("--starts", nargs="+", type=int, default=[0, 4], help="first of the two frames")
-    parser.add_argument("--out", type=Path, default=default_folder())
+    parser.add_argument("--out", type=Path, default=Path("runs/first_velocity"))
     given = parser.parse_args()
     torch.set_num_threads(1)
     result = measure(given.root, given.scenes, given.variants, given.split, given.count, given.starts)

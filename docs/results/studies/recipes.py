@@ -1,8 +1,9 @@
-"""What each part of the training recipe buys: ``python -m benchmarks.recipes FOLDER [--rows NAME,...] [--seeds 0,1]``.
+"""What each part of the training recipe buys.
 
-Trains ``model=inertial`` on MuJoCo Block for an equal number of updates, once for each row and seed, and measures it on
-the validation split; ``python -m benchmarks.motion_table FOLDER --evaluation evaluation_validation`` brings the figures
-together. What is done already is left as it is, and what was killed goes on. Two runs share two cores (``--beside``).
+``python -m docs.results.studies.recipes FOLDER [--rows NAME,...] [--seeds 0,1]`` trains ``model=inertial`` on MuJoCo
+Block for an equal number of updates, once for each row and seed, and measures it on the validation split; ``python -m
+docs.results.studies.motion_table FOLDER --evaluation evaluation_validation`` brings the figures together. What is
+done already is left as it is, and what was killed goes on. Two runs share two cores (``--beside``).
 """
 
 import argparse
