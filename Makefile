@@ -119,7 +119,7 @@ stability: $(STAMP) ## Run the whole numerical stability matrix; the last line c
 
 reliability: $(STAMP) ## Kill, damage, mutate, requeue: every promise of docs/reliability.md, in under 40 minutes; writes its table
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.reliability
-	$(BIN)/python -m tests.reliability.page
+	$(BIN)/python -m benchmarks.page
 
 audit: ## Ask pip-audit about the locked versions; fails where it cannot tell (needs an index that has advisories)
 	test -x .venv-audit/bin/pip-audit || { $(PYTHON) -m venv .venv-audit && .venv-audit/bin/python -m pip install pip-audit; }

@@ -1,8 +1,12 @@
-"""Write the measured figures into ``docs/benchmarks.md``: ``python -m benchmarks.page [RESULTS_FOLDER]``.
+"""Write the measured figures into the pages: ``python -m benchmarks.page [RESULTS_FOLDER] [--check]``.
 
-No figure on that page is typed by hand. Between ``<!-- results: FILE VIEW -->`` and ``<!-- end of results -->`` stands
-what this module made of ``FILE.json``; VIEW is ``table``, ``facts``, ``floors`` (of train_step),
-``memory`` (of memory_table), ``reading``, ``making`` (of data) or ``plot``.
+No figure of README.md, of ``docs/`` or of a card in ``released/`` is typed by hand:
+
+- Between ``<!-- results: FILE VIEW -->`` and ``<!-- end of results -->`` stands what ``VIEWS`` makes of a result file.
+- A number in running text is followed by its source, as ``benchmarks/figures.py`` describes.
+- A card is written from the files beside it (``benchmarks/cards.py``).
+
+With ``--check`` nothing is written, and the pages that would change are named.
 """
 
 import json
@@ -13,6 +17,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks import page_tables
+from benchmarks.cards import card
+from benchmarks.figures import content_of, file_of, with_figures
 from benchmarks.measuring import Row
 from benchmarks.memory_table import GIB, markdown
 from benchmarks.results_files import default_folder, read, shown, table
@@ -22,15 +29,48 @@ PAGE = ROOT / "docs" / "benchmarks.md"
 _BLOCK = re.compile(r"(<!-- results: (?P<file>\w+) (?P<view>\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 
-def main() -> None:
-    """Rewrite all blocks of the page."""
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else default_folder()
-    PAGE.write_text(filled(PAGE.read_text(), folder))
-    print(PAGE)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Rewrite all pages and cards, or name those that are out of date."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    is_check = "--check" in words
+    folders = [Path(word) for word in words if word != "--check"]
+    changed = out_of_date(folders[0] if folders else default_folder())
+    for path, text in changed.items():
+        if not is_check:
+            path.write_text(text)
+        print(f"{path.relative_to(ROOT)}: {'not what the result files say' if is_check else 'written'}")
+    return 1 if is_check and changed else 0
+
+
+def pages() -> list[Path]:
+    """Return README and the pages of ``docs``."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def cards() -> list[Path]:
+    """Return the cards of the released models."""
+    return sorted((ROOT / "released").glob("*/README.md"))
+
+
+def out_of_date(folder: Path) -> dict[Path, str]:
+    """Return the pages and cards that do not say what the result files say, with what they should be.
+
+    Raises:
+        ValueError: a page names a view or a source that does not exist.
+    """
+    right = {path: _located(path, folder) for path in pages()} | {path: card(path.parent) for path in cards()}
+    return {path: text for path, text in right.items() if path.read_text() != text}
+
+
+def _located(path: Path, folder: Path) -> str:
+    try:
+        return with_figures(filled(path.read_text(), folder))
+    except ValueError as error:
+        raise ValueError(f"{path.relative_to(ROOT)}: {error}") from None
 
 
 def filled(text: str, folder: Path) -> str:
-    """Return the page with every block made anew from the result files in ``folder``.
+    """Return the page with every block made anew from the result files in ``folder``, or in ``docs/results``.
 
     Raises:
         ValueError: a block asks for a view that does not exist.
@@ -40,14 +80,20 @@ def filled(text: str, folder: Path) -> str:
         view = match["view"]
         if view not in VIEWS:
             raise ValueError(f"There is no view {view!r}; known are {', '.join(VIEWS)}.")
-        path = folder / f"{match['file']}.json"
+        path = _file(match["file"], folder, is_suite=view not in _READERS or view == "memory")
+        content = f"Not measured: `{path.name}` is not among the results."
         if path.exists():
-            content = VIEWS[view](json.loads(path.read_text()) if view == "memory" else read(path), path)
-        else:
-            content = f"Not measured: `{path.name}` is not among the results."
+            content = VIEWS[view](_READERS.get(view, read)(path), path)
         return f"{match[1]}{content}\n{match[4]}"
 
     return _BLOCK.sub(block, text)
+
+
+def _file(name: str, folder: Path, *, is_suite: bool) -> Path:
+    """Results of suites lie in ``folder``, whose machine the page is about; all others where they are committed."""
+    if is_suite:
+        return folder / f"{name}.json"
+    return ROOT / name if (ROOT / name).is_dir() else file_of(name)
 
 
 def _table(content: dict[str, Any], path: Path) -> str:
@@ -139,7 +185,7 @@ def _machine(content: dict[str, Any]) -> str:
     return f"{content['device']}; {versions}."
 
 
-VIEWS: dict[str, Callable[[dict[str, Any], Path], str]] = {
+VIEWS: dict[str, Callable[[Any, Path], str]] = {
     "table": _table,
     "facts": _facts,
     "floors": _floors,
@@ -148,7 +194,12 @@ VIEWS: dict[str, Callable[[dict[str, Any], Path], str]] = {
     "reading": _reading,
     "making": _making,
 }
+_OF_RESULTS = ("motion", "ablation", "recipes", "report", "sparsity", "first_velocity", "edits", "demo", "promises")
+VIEWS |= {name: getattr(page_tables, name) for name in (*_OF_RESULTS, "releases")}
+# How a view's file is read, where it is not the result of a suite.
+_READERS: dict[str, Callable[[Path], Any]] = dict.fromkeys(_OF_RESULTS, content_of)
+_READERS |= {"memory": lambda path: json.loads(path.read_text()), "releases": lambda path: None}
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
