@@ -1,7 +1,6 @@
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -89,12 +88,11 @@ def test_wrong_use_gets_a_short_message_and_its_exit_code(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_help_is_quick_and_loads_nothing_heavy():
+def test_help_loads_nothing_heavy():  # tests/test_architecture.py counts what it does
     script = (
         "import sys; from vpd_lightning.commands.data import main; code = main(['--help']); "
         "print('LOADED', {'torch', 'mujoco', 'h5py', 'omegaconf', 'numpy'} & set(sys.modules)); sys.exit(code)"
     )
-    start = time.monotonic()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
     result = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, env=environment, check=False
@@ -103,7 +101,6 @@ def test_help_is_quick_and_loads_nothing_heavy():
     assert result.returncode == 0, result.stderr
     assert "LOADED set()" in result.stdout
     assert all(f"vpd-data {verb}" in result.stdout for verb in VERBS)
-    assert time.monotonic() - start < 3
 
 
 @pytest.mark.parametrize("kind", [ConfigError, DataError, CheckpointError, OutOfMemoryError])

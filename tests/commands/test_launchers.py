@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.reliability.trainings import start
+from tests.waiting import HANG
 from vpd_lightning.config.explaining import _explain_missing_option
 
 LAUNCHER = ["-m", "hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5"]
@@ -15,7 +16,7 @@ LAUNCHER = ["-m", "hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5
 def multirun(words: Sequence[str], folder: Path) -> tuple[int, str]:
     pytest.importorskip("submitit")
     process = start([*LAUNCHER, *words], cwd=folder, stderr=subprocess.STDOUT)
-    output, _ = process.communicate(timeout=300)
+    output, _ = process.communicate(timeout=HANG)
     return process.returncode, output
 
 

@@ -5,13 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
 
+from tests.waiting import HANG, wait_until
 from vpd_lightning.commands import train
 from vpd_lightning.training.checkpoint_files import load_checkpoint
 
@@ -130,17 +130,14 @@ def test_run_killed_before_its_first_checkpoint_is_moved_aside_and_started_anew(
     late += ["callbacks.keep_checkpoints.every_n_steps=100000", "resume=auto", "run.folder=here"]
     # With every logger of a usual run.
     process = start([*(word for word in quick if word != "logger=csv"), *late], in_folder)
-    deadline = time.monotonic() + 120
-    while not (in_folder / "here" / "metrics.csv").is_file() and time.monotonic() < deadline:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.1)
+    wait_until((in_folder / "here" / "metrics.csv").is_file, process)
     words = [*quick, "trainer.max_steps=1", "run.folder=here"]
 
     # While it is alive nobody else may have its folder.
     assert "a run that is still going" in fails(train.main, [*words, "resume=auto"], 2)
 
     process.kill()
-    process.communicate(timeout=60)
+    process.communicate(timeout=HANG)
     left = {path.name: path.read_bytes() for path in (in_folder / "here").iterdir() if path.is_file()}
     assert "Start anew in it with resume=auto" in fails(train.main, words, 2)
     assert {path.name for path in in_folder.iterdir()} == {"here"}
@@ -207,13 +204,10 @@ def test_signal_saves_a_checkpoint_and_gives_the_shells_exit_code(
     quick: list[str], in_folder: Path, number: signal.Signals, code: int
 ):
     process = start([*quick, "trainer.max_steps=100000", "run.folder=here"], in_folder)
-    deadline = time.monotonic() + 120
-    while not (in_folder / "here" / "checkpoints" / "last.ckpt").is_file() and time.monotonic() < deadline:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.1)
+    wait_until((in_folder / "here" / "checkpoints" / "last.ckpt").is_file, process)
 
     process.send_signal(number)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=HANG)
 
     assert process.returncode == code, out + err
     assert "Traceback" not in err
@@ -224,7 +218,7 @@ def test_signal_saves_a_checkpoint_and_gives_the_shells_exit_code(
 @pytest.mark.ddp
 def test_two_processes_share_one_run_folder(quick: list[str], in_folder: Path):
     process = start([*quick, "trainer=ddp_cpu"], in_folder)
-    out, err = process.communicate(timeout=240)
+    out, err = process.communicate(timeout=HANG)
 
     assert process.returncode == 0, out + err
     [folder] = run_folders(in_folder)

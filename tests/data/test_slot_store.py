@@ -3,8 +3,6 @@
 import json
 import pickle
 import shutil
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -187,13 +185,17 @@ def test_slots_that_are_not_numbers_are_refused(
         extract(tmp_path, data_folder, trajectories, source, lambda rgb: known_slots(rgb) / 0.0)
 
 
-def test_other_processes_wait_for_the_first(tmp_path: Path) -> None:
-    index = tmp_path / INDEX_FILE
-    writer = threading.Timer(0.5, index.touch)
-    started = time.monotonic()
-    writer.start()
+def test_other_processes_wait_for_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    index, pauses = tmp_path / INDEX_FILE, []
+
+    def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 3:
+            index.touch()
+
+    monkeypatch.setattr("time.sleep", pause)
     wait_for_slots(index)
-    assert time.monotonic() - started >= 0.5
+    assert len(pauses) == 3 and min(pauses) > 0
 
 
 class KnownSystem(nn.Module):

@@ -2,7 +2,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from data_gen import dataset_folder
 from data_gen import generate as module
 from tests.data_gen.blocks import contents, generate_small
+from tests.waiting import HANG, wait_until
 from vpd_lightning.data.ground_truth import read_state
 from vpd_lightning.data.manifest import file_sha256, load_manifest
 from vpd_lightning.data.reader import TrajectoryReader
@@ -175,11 +175,9 @@ def test_stopped_with_workers_leaves_no_half_file(tmp_path: Path, number: signal
         # A shell lets what it starts in the background ignore Ctrl-C, tests included, and that is inherited.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    deadline = time.monotonic() + 60
-    while not list(out.glob("train/*.h5")) and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_until(lambda: list(out.glob("train/*.h5")), process)
     os.killpg(process.pid, number)  # as a terminal does: to the workers as well
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=HANG)
 
     assert process.returncode == code, errors.decode()
     assert b"Traceback" not in errors

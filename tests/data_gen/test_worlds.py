@@ -4,13 +4,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from data_gen.settings import preset_names, scene_names
 from tests.data_gen.blocks import contents
+from tests.waiting import HANG, wait_until
 from vpd_lightning.data.manifest import load_manifest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,7 +33,7 @@ def start(scene: str, out: Path, workers: int, *words: str) -> subprocess.Popen[
 
 
 def finish(process: subprocess.Popen[bytes]) -> None:
-    _, errors = process.communicate(timeout=300)
+    _, errors = process.communicate(timeout=HANG)
     assert process.returncode == 0, errors.decode()
 
 
@@ -56,9 +56,7 @@ def test_workers_and_a_kill_change_nothing(scene: str, tmp_path: Path):
 
     killed = tmp_path / "killed"
     process = start(scene, killed, workers=2)
-    deadline = time.monotonic() + 120
-    while not list(killed.glob("*/*.h5")) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_until(lambda: list(killed.glob("*/*.h5")), process)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
     assert contents(killed), "it was killed before the first file"

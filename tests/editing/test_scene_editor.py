@@ -6,6 +6,7 @@ import torch
 
 import vpd_lightning as vpd
 from tests.editing.scenes import BLUE, FLOOR, RED, TONES, VELOCITY, same, two_boxes
+from tests.work import TensorWork, counted_calls
 from vpd_lightning.editing.rotation import about_axis, matrix_of
 from vpd_lightning.editing.selectors import Box, Cluster, Color, Everything, Lasso, Sphere
 from vpd_lightning.errors import EditError
@@ -239,9 +240,7 @@ def test_what_does_not_fit_is_refused_by_name():
             act()
 
 
-def test_ten_thousand_particles_are_selected_within_fifty_milliseconds():
-    import time
-
+def test_ten_thousand_particles_are_selected_at_once():
     from vpd_lightning.simulator import Scene
     from vpd_lightning.types import Particles
 
@@ -251,9 +250,9 @@ def test_ten_thousand_particles_are_selected_within_fifty_milliseconds():
     camera = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]).tolist(), torch.eye(4).tolist()
     polygon = [[50 + 40 * math.cos(a), 50 + 40 * math.sin(a)] for a in range(0, 628, 20)]
     for what in (Box([0, 0, 0], [0.5] * 3), Sphere([0.5] * 3, 0.3), Color([0.5] * 3, 0.3), Lasso(*camera, polygon)):
-        times = []
-        for _ in range(3):
-            start = time.perf_counter()
+        with TensorWork() as work, counted_calls() as python:
             assert int(editor.select(what).sum()) > 0
-            times.append(time.perf_counter() - start)
-        assert min(times) < 0.05, what
+        # A loop over particles would take more calls than there are particles. The polygon has 32 corners: counted here
+        # are 332 numbers per particle; the others take 24.
+        assert python.calls < 10_000 and work.operations < 500, what
+        assert work.numbers < (400 if isinstance(what, Lasso) else 40) * 10_000, what

@@ -7,6 +7,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from tests.waiting import HANG
+
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "first_look.ipynb"
 
 
@@ -27,7 +29,7 @@ def test_the_notebook_runs(notebook: Any, tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv("JUPYTER_RUNTIME_DIR", str(tmp_path / "runtime"))
     monkeypatch.delenv("MPLBACKEND", raising=False)  # `make test` sets it, and no picture would be shown
     place = {"metadata": {"path": str(tmp_path)}}
-    NotebookClient(notebook, timeout=90, resources=place).execute()
+    NotebookClient(notebook, timeout=int(HANG), resources=place).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     pictures = [output for output in outputs if "image/png" in output.get("data", {})]
     assert len(pictures) == 5, "inputs, prediction, ring, particles, distances"

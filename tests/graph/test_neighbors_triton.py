@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.waiting import HANG
 from vpd_lightning.errors import ConfigError, NonFiniteError
 from vpd_lightning.graph.neighbors import Neighbors, PointIndex, knn, radius
 
@@ -191,7 +192,7 @@ def test_in_the_interpreter() -> None:
         env={**os.environ, "TRITON_INTERPRET": "1"},
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=HANG,
     )
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-1000:]
     assert " passed" in result.stdout

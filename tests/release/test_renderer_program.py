@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.waiting import HANG
 from vpd_lightning.config import build_simulator, compose
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.release.renderer_program import export_renderer, write_program
@@ -60,7 +61,7 @@ def test_a_program_draws_what_the_renderer_draws_without_this_package(tmp_path: 
         assert num_valid == 0 or (drawn.opacities.mean() > 0.5 and drawn.depths.std() > 0.01), "there is something"
     torch.save(inputs, tmp_path / "inputs.pt")
     files = [str(tmp_path / name) for name in ("renderer.pt2", "inputs.pt", "drawn.pt")]
-    subprocess.run([sys.executable, "-c", CALLER, *files], check=True, cwd=tmp_path, timeout=120)
+    subprocess.run([sys.executable, "-c", CALLER, *files], check=True, cwd=tmp_path, timeout=HANG)
     torch.testing.assert_close(torch.load(tmp_path / "drawn.pt")[0], drawn.rgbs, rtol=1e-4, atol=1e-4)
 
 

@@ -8,6 +8,7 @@ from typing import IO
 
 import pytest
 
+from tests.waiting import HANG
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.runs import run_claim
 from vpd_lightning.runs.run_claim import CLAIM, claimed, foreign_files, is_claimed, set_aside
@@ -33,7 +34,7 @@ def test_folder_is_claimed_while_a_process_has_it_and_free_after_that_was_killed
     assert (folder / CLAIM).read_text() == f"{process.pid}\n"
 
     process.kill()
-    process.communicate(timeout=30)
+    process.communicate(timeout=HANG)
     assert (folder / CLAIM).is_file() and not is_claimed(folder)
     with claimed(folder, is_new=False):
         pass

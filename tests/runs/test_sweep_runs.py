@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.waiting import HANG, wait_until
 from vpd_lightning.commands import train
 from vpd_lightning.errors import DataError
 from vpd_lightning.runs.run_claim import CLAIM
@@ -82,7 +82,7 @@ def another_process_has(job: SweepJob) -> Iterator[None]:
         yield
     finally:
         process.kill()
-        process.communicate(timeout=30)
+        process.communicate(timeout=HANG)
 
 
 def test_second_start_skips_what_is_done_and_goes_on_with_what_was_begun(
@@ -238,12 +238,9 @@ def test_killed_sweep_goes_on_where_it_stopped(
         [sys.executable, "-m", "vpd_lightning.commands.train", "-m", *words, f"--config-dir={options}"],
         env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    deadline = time.monotonic() + 120
-    while not (second.folder / "checkpoints" / LAST).is_file() and time.monotonic() < deadline:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.01)
+    wait_until((second.folder / "checkpoints" / LAST).is_file, process, pause=0.005)
     process.kill()
-    process.communicate(timeout=30)
+    process.communicate(timeout=HANG)
     assert not second.is_complete
 
     assert train.main(["-m", *words, f"--config-dir={options}"]) == 0

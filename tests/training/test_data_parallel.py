@@ -12,6 +12,7 @@ import torch
 
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import tiny_data, tiny_module, tiny_simulator, tiny_trainer
+from tests.waiting import HANG
 
 
 class KeepGradients(pl.Callback):
@@ -45,7 +46,7 @@ def test_two_processes_give_the_gradients_and_the_validation_of_one(tmp_path: Pa
     program = "from tests.training.test_data_parallel import *; train(Path(sys.argv[1]), Path(sys.argv[2]), devices=2)"
     command = [sys.executable, "-c", program, str(data), str(tmp_path / "two")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=HANG, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     gradients = [torch.load(tmp_path / run / "gradients.pt", weights_only=True) for run in ("one", "two")]
     scores = [(tmp_path / run / "metrics.csv").read_text().split(",")[-2:] for run in ("one", "two")]

@@ -14,6 +14,7 @@ import torch
 from data_gen.inspection.split import split_dataset
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import SignalAt, tiny_data, tiny_module, tiny_trainer
+from tests.waiting import HANG
 from vpd_lightning.data.manifest import DATA_SHA256, TRAINED_ON, load_manifest
 from vpd_lightning.training.checkpoint_files import load_checkpoint, write_checkpoint
 from vpd_lightning.training.checkpoints import find_resume
@@ -39,7 +40,7 @@ def train_and_die(data: Path, run: Path, step: int, num_workers: int) -> int:
     command = [sys.executable, "-m", "tests.training.tiny_training", str(data), str(run), f"--steps={STEPS}"]
     command += [f"--workers={num_workers}", f"--kill-at={step}"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=HANG, check=False)
     assert "\x1b" not in done.stdout + done.stderr  # no terminal, no control characters
     return done.returncode
 

@@ -19,6 +19,7 @@ from playwright.sync_api import Page, sync_playwright
 import vpd_lightning as vpd
 from tests.editing.scenes import same
 from tests.released_demo import demo_model, make_demo_data
+from tests.waiting import HANG
 from vpd_lightning.editing.edit_files import load_edit, replay
 from vpd_lightning.editing.selectors import Cluster
 from vpd_lightning.viewer.guard import new_token
@@ -29,7 +30,7 @@ from vpd_lightning.viewer.server import Viewer
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-TIMEOUT = 120_000  # milliseconds; a browser that draws in software, beside other tests
+TIMEOUT = 1000 * HANG  # milliseconds
 
 pytestmark = [
     pytest.mark.slow,

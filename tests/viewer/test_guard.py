@@ -3,7 +3,6 @@
 import http.client
 import socket
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from tests.viewer.opened import open_tossed_box
+from tests.waiting import HANG, wait_until
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.viewer.guard import MAX_UPLOAD_BYTES, new_token, require_free, start_guarded_server
 from vpd_lightning.viewer.server import Viewer
@@ -37,7 +37,7 @@ def viewer(tmp_path_factory: pytest.TempPathFactory):
 
 
 def ask(viewer: Viewer, path: str, **headers: str) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection("127.0.0.1", viewer.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", viewer.port, timeout=HANG)
     connection.putrequest("GET", path, skip_host="Host" in headers)
     for name, value in headers.items():
         connection.putheader(name, value)
@@ -46,7 +46,7 @@ def ask(viewer: Viewer, path: str, **headers: str) -> http.client.HTTPResponse:
 
 
 def socket_of(viewer: Viewer, query: str = f"?token={TOKEN}", **options):
-    return connect(f"ws://127.0.0.1:{viewer.port}/{query}", subprotocols=[PROTOCOL], open_timeout=20, **options)
+    return connect(f"ws://127.0.0.1:{viewer.port}/{query}", subprotocols=[PROTOCOL], open_timeout=HANG, **options)
 
 
 def test_it_listens_on_the_loopback_interface_alone(viewer: Viewer) -> None:
@@ -95,7 +95,7 @@ def test_the_socket_needs_the_token_and_our_own_page(viewer: Viewer) -> None:
             socket_of(viewer, query, **options)
         assert refused.value.response.status_code == 403
     with socket_of(viewer, origin=f"http://127.0.0.1:{viewer.port}") as connection:
-        assert isinstance(connection.recv(timeout=20), bytes)
+        assert isinstance(connection.recv(timeout=HANG), bytes)
 
 
 @pytest.mark.parametrize(
@@ -125,13 +125,8 @@ def test_tokens_differ_and_no_share_link_is_made(viewer: Viewer) -> None:
 
 def settled_panel(viewer: Viewer, before: set[int]):
     """The panel of the client that just came."""
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        new = set(viewer.panels) - before
-        if new:
-            return viewer.panels[new.pop()]
-        time.sleep(0.05)
-    raise AssertionError("no panel appeared")
+    wait_until(lambda: set(viewer.panels) - before)
+    return viewer.panels[(set(viewer.panels) - before).pop()]
 
 
 def drain(connection) -> None:
@@ -170,13 +165,6 @@ def test_uploads_beyond_the_cap_and_beyond_what_was_announced_are_dropped(viewer
         for part in (0, 1):
             connection.send(serialized(_messages.FileTransferPart(target, "a", part, b"12345")))
         wait_until(lambda: set(pending) == {"b"})
-
-
-def wait_until(condition) -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 def camera_message() -> bytes:

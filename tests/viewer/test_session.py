@@ -18,6 +18,7 @@ import trimesh
 import vpd_lightning as vpd
 from tests.editing.scenes import same
 from tests.viewer.opened import open_tossed_box
+from tests.waiting import HANG
 from vpd_lightning.editing.edit_files import load_edit, replay
 from vpd_lightning.editing.operations import Delete, Duplicate, Move
 from vpd_lightning.editing.selectors import Box, Everything
@@ -125,7 +126,7 @@ class Shown:
 
     def wait_for(self, number: int) -> None:
         with self.changed:
-            assert self.changed.wait_for(lambda: len(self.pictures) >= number, timeout=60)
+            assert self.changed.wait_for(lambda: len(self.pictures) >= number, timeout=HANG)
 
 
 def viewpoint(opened: OpenedScene, aspect: float = 1.0) -> Viewpoint:
@@ -138,7 +139,7 @@ def test_a_coarse_picture_comes_first_and_the_full_one_is_that_of_the_simulator(
     view._pixels_per_second = 1.0  # a slow machine
     try:
         view.ask(Request([state], viewpoint(opened, 1.5), 40))
-        assert shown.event.wait(60)
+        assert shown.event.wait(HANG)
     finally:
         view.stop()
     (coarse, is_coarse_full), (full, is_full) = shown.pictures
@@ -157,12 +158,12 @@ class HeldRenderer:
 
     def __call__(self, *arguments: Any) -> Any:
         self.begun.release()
-        assert self.let.acquire(timeout=60)
+        assert self.let.acquire(timeout=HANG)
         return self.renderer(*arguments)
 
     def wait(self) -> None:
         """Wait until it has begun to draw."""
-        assert self.begun.acquire(timeout=60)
+        assert self.begun.acquire(timeout=HANG)
 
     def draw(self) -> None:
         """Let it draw once."""
@@ -204,7 +205,7 @@ def test_what_is_out_of_date_is_not_finished(opened: OpenedScene, monkeypatch: p
         for _ in range(1 + 2 * 32):
             held.wait()
             held.draw()
-        assert shown.event.wait(60)
+        assert shown.event.wait(HANG)
     finally:
         held.let.release(1000)
         view.stop()

@@ -2,7 +2,6 @@
 
 import sys
 import textwrap
-import time
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 
 from data_gen.blender import messages, process
 from data_gen.blender.process import BlenderProcess, find_python
+from tests.waiting import HANG
 from vpd_lightning.errors import ConfigError, RenderingBackendError
 
 HEAD = f"""
@@ -71,7 +71,7 @@ def test_questions_larger_than_a_pipe_are_answered():
         assert child.version == "stand-in"
         values = np.arange(2_000_000, dtype=np.float32)
         for _ in range(2):
-            _, arrays = child.ask({"kind": "frame"}, {"values": values}, timeout=60)
+            _, arrays = child.ask({"kind": "frame"}, {"values": values}, timeout=HANG)
             assert np.array_equal(arrays["values"], values + 1)
         assert child.is_alive
     finally:
@@ -88,7 +88,7 @@ def test_death_is_reported_with_its_last_words():
         raise SystemExit(9)
     """)
     with pytest.raises(RenderingBackendError) as caught:
-        child.ask({"kind": "frame"}, {}, timeout=60)
+        child.ask({"kind": "frame"}, {}, timeout=HANG)
     child.close()
     message = str(caught.value)
     assert "ended during: frame (exit code 9)" in message and "Segmentation fault in shader 7" in message
@@ -107,11 +107,9 @@ def test_python_that_cannot_be_started_is_reported(tmp_path: Path):
 
 
 def test_silence_ends_after_the_timeout():
-    start = time.monotonic()
-    child = stand_in('answer({"kind": "ready"})\ntime.sleep(600)')
+    child = stand_in('answer({"kind": "ready"})\nwhile True: time.sleep(600)')  # it never ends by itself
     with pytest.raises(RenderingBackendError, match="did not answer in time"):
         child.ask({"kind": "frame"}, {}, timeout=0.3)
-    assert time.monotonic() - start < 30
     assert not child.is_alive
     child.close()
 
@@ -124,7 +122,7 @@ def test_failure_that_the_child_survives_is_reported():
         messages.unpack(read)
     """)
     with pytest.raises(RenderingBackendError, match="failed on a scene: ValueError: no such node"):
-        child.ask({"kind": "scene"}, {}, timeout=60)
+        child.ask({"kind": "scene"}, {}, timeout=HANG)
     assert child.is_alive
     child.close()
 

@@ -2,7 +2,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +17,7 @@ from data_gen.importers.settings import load_import_settings
 from tests.data_gen.importers import known_scene
 from tests.data_gen.importers.checks import TOLERANCE, assert_valid, attributes, camera_errors, files, worst_point
 from tests.data_gen.importers.plain_recording import HEIGHT, WIDTH, write_plain
+from tests.waiting import HANG, wait_until
 from vpd_lightning.data.manifest import file_sha256, load_manifest
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.errors import ConfigError, DataError
@@ -107,11 +107,9 @@ def test_ctrl_c_leaves_whole_files_only(source: Path, imported: Path, tmp_path: 
         f"run.import_recordings({str(source)!r}, {str(tmp_path / 'set')!r})\n"
     )
     process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not files(tmp_path / "set") and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_until(lambda: files(tmp_path / "set"), process)
     os.kill(process.pid, signal.SIGINT)
-    assert "KeyboardInterrupt" in process.communicate(timeout=60)[1]
+    assert "KeyboardInterrupt" in process.communicate(timeout=HANG)[1]
 
     some = contents(tmp_path / "set")
     assert 0 < len(some) < 5
