@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.bugs.apply import Bug, find, load_bugs, put_in
-from tests.bugs.trees import ROOT, copy_of_the_tree, run_pytest
+from tests.bugs.trees import ROOT, copy_of_the_tree, load_libraries, run_pytest
 
 
 class Recording:
@@ -99,9 +99,7 @@ def _run(rounds: list[list[str]], executing: set[str], folder: Path, cpu_seconds
             return {"tests_run": tests_run, "note": f"out of time ({cpu_seconds} s of processor time)"}
         words.write_text("\n".join(tests) + "\n")
         outcomes.unlink(missing_ok=True)
-        status, said = run_pytest(
-            folder, ["-x", "--tb=line", f"@{words}"], outcomes, cpu_seconds=left, timeout=10.0 * left
-        )
+        status, said = run_pytest(folder, ["-x", "--tb=line", f"@{words}"], outcomes, cpu_seconds=left)
         lines = [json.loads(line) for line in outcomes.read_text().splitlines()] if outcomes.exists() else []
         ran = [line for line in lines if "test" in line and line["outcome"] != "skipped"]
         tests_run += len(ran)
@@ -131,6 +129,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file; results of faults that are not judged now stay in it")
     parser.add_argument("--seconds", type=int, default=120, help="processor time for each fault (%(default)s)")
     given = parser.parse_args()
+    load_libraries()
     recording = Recording(given.hits)
     results = json.loads(given.out.read_text()) if given.out and given.out.exists() else {}
     with tempfile.TemporaryDirectory(prefix="vpd-bugs-") as name:

@@ -1,6 +1,7 @@
 """Copies of the repository to make faults in, and how pytest runs there."""
 
 import ast
+import importlib.util
 import os
 import resource
 import shutil
@@ -11,7 +12,14 @@ from pathlib import Path
 
 from tests.bugs.apply import Bug, find
 
+os.environ["OMP_NUM_THREADS"] = "1"  # before NumPy and torch are loaded
 ROOT = Path(__file__).resolve().parents[2]
+LIBRARIES = (
+    "lightning.pytorch", "torch_geometric", "torch_geometric.utils", "numba", "scipy.spatial", "scipy.ndimage",
+    "scipy.sparse.csgraph", "hydra", "omegaconf", "h5py", "cv2", "matplotlib.figure", "torchmetrics", "sklearn.cluster",
+    "trimesh", "PIL.Image", "rich.console", "safetensors.torch", "torch.utils.tensorboard", "isal.igzip",
+    "jaxtyping", "beartype", "pytest",
+)  # fmt: skip
 
 
 def copy_of_the_tree(folder: Path) -> Path:
@@ -56,34 +64,51 @@ def put_in_probe(bug: Bug, tree: Path) -> None:
     path.write_text("".join(lines))
 
 
+def load_libraries() -> None:
+    """Import what tests import, but nothing of ours: ``run_pytest`` forks, and importing takes longer than most tests.
+
+    Under the shape checks, what is imported first by a module of ours is even compiled anew in each process.
+    """
+    import torch
+
+    torch.set_num_threads(1)
+    for name in LIBRARIES:
+        if importlib.util.find_spec(name.partition(".")[0]) is not None:
+            importlib.import_module(name)
+
+
 def run_pytest(
-    folder: Path, words: Sequence[str], results: Path, *, cpu_seconds: int | None = None, timeout: float | None = None
+    folder: Path, words: Sequence[str], results: Path, *, cpu_seconds: int | None = None
 ) -> tuple[int | None, str]:
     """Run pytest in a copy, with the plugin; return its exit status (None: out of time) and what it said."""
-    tree = folder / "tree"
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(map(str, (tree / "src", tree))),
-        "BUG_PROBES_FILE": str(results),
-        "OMP_NUM_THREADS": "1",
-    }
+    said = folder / "said"
+    child = os.fork()
+    if child == 0:
+        status = 70
+        try:
+            status = _as_a_child(folder / "tree", words, results.resolve(), said, cpu_seconds)
+        finally:
+            os._exit(status)
+    _, ended = os.waitpid(child, 0)
+    return (os.WEXITSTATUS(ended) if os.WIFEXITED(ended) else None), said.read_text()
 
-    def limited() -> None:
-        if cpu_seconds is not None:
-            resource.setrlimit(resource.RLIMIT_CPU, (cpu_seconds, cpu_seconds))
 
-    command = [sys.executable, "-m", "pytest", "-p", "bug_probes", "-p", "no:cacheprovider", "-q", *words]
-    try:
-        done = subprocess.run(
-            command,
-            cwd=tree,
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=timeout,
-            preexec_fn=limited,
-        )
-    except subprocess.TimeoutExpired:
-        return None, ""
-    return (None if done.returncode < 0 else done.returncode), done.stdout
+def _as_a_child(tree: Path, words: Sequence[str], results: Path, said: Path, cpu_seconds: int | None) -> int:
+    with said.open("w") as stream:
+        os.dup2(stream.fileno(), 1)
+        os.dup2(stream.fileno(), 2)
+    if cpu_seconds is not None:
+        resource.setrlimit(resource.RLIMIT_CPU, (cpu_seconds, cpu_seconds))
+    os.chdir(tree)
+    paths = [str(tree / "src"), str(tree)]
+    os.environ |= {"PYTHONPATH": os.pathsep.join(paths), "BUG_PROBES_FILE": str(results)}
+    # The tree that this program runs from must not answer for the copy.
+    own = {str(ROOT), str(ROOT / "src"), ""}
+    sys.path[:] = [*paths, *(path for path in sys.path if path not in own)]
+    for name in [name for name in sys.modules if name.partition(".")[0] == "tests"]:
+        del sys.modules[name]
+    import pytest
+
+    status = int(pytest.main(["-p", "bug_probes", "-p", "no:cacheprovider", "-q", *words]))
+    sys.stdout.flush()
+    return status
