@@ -137,7 +137,7 @@ class _Stored:
 
 
 def _read(path: Path) -> _Stored:
-    from vpd_lightning.data.manifest import TRAINED_ON
+    from vpd_lightning.data.trained_on import TRAINED_ON
     from vpd_lightning.training.checkpoint_files import open_checkpoint
     from vpd_lightning.training.checkpoints import open_resume
 

@@ -11,7 +11,8 @@ import pytest
 from data_gen.inspection.split import split_dataset
 from tests.data.recordings import write_dataset_file
 from vpd_lightning.commands import data, eval, export, train
-from vpd_lightning.data.manifest import TRAINED_ON, load_manifest, write_manifest
+from vpd_lightning.data.manifest import load_manifest, write_manifest
+from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.data.verdict import FILE_NAME as VERDICT
 from vpd_lightning.training.checkpoint_files import load_checkpoint
 

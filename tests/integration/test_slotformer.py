@@ -30,7 +30,7 @@ def words(data_folder: Path, run: Path, model: str = "slotformer") -> list[str]:
     chosen = [
         f"model={model}", "budget=tiny", f"data.folder={data_folder}", f"run.folder={run}", "scene.input_views=[0]",
         f"trainer.max_steps={STEPS}", f"trainer.val_check_interval={STEPS}", "num_threads=1", "logger=csv",
-        "callbacks.keep_checkpoints.every_n_steps=2", "callbacks.draw_rollouts=null",
+        "callbacks.keep_checkpoints.every_n_steps=2", "callbacks.draw_rollouts=null", "force=true",
     ]  # fmt: skip
     return chosen if model == "savi" else [*chosen, f"pretraining.settings.trainer.max_steps={STEPS}"]
 

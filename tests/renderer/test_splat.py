@@ -266,8 +266,8 @@ def test_fifty_thousand_particles_take_neither_long_nor_much_memory(backend):
     # All pairs would be 51 million numbers; the search scores a quarter of a million at a time (ray_search.py), and a
     # chunk of 256 rays gathers less.
     assert work.largest <= max(1 << 18, scene.features.numel())
-    # What takes minutes is a loop of Python over particles, or many passes over all pairs of particles and rays. Counted
-    # here: 9,600 operations and 18 numbers per pair by brute force, 860 and 0.2 compiled.
+    # What takes minutes is a loop of Python over particles, or many passes over all pairs of particles and rays.
+    # Counted here: 9,600 operations and 18 numbers per pair by brute force, 860 and 0.2 compiled.
     assert work.operations < 15_000 and python.calls < 500_000
     assert work.numbers < (30 if backend == "torch" else 1) * 50_000 * 1024
 

@@ -13,7 +13,7 @@ import yaml
 from vpd_lightning.commands.train import main
 from vpd_lightning.config import compose, pretraining_config
 from vpd_lightning.config.pretraining import FOLDER
-from vpd_lightning.data.manifest import TRAINED_ON
+from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.errors import CheckpointError
 from vpd_lightning.loading import load
 from vpd_lightning.runs.first_training import DONE_FILE, load_pretrained

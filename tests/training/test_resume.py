@@ -15,7 +15,8 @@ from data_gen.inspection.split import split_dataset
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import SignalAt, tiny_data, tiny_module, tiny_trainer
 from tests.waiting import HANG
-from vpd_lightning.data.manifest import DATA_SHA256, TRAINED_ON, load_manifest
+from vpd_lightning.data.manifest import load_manifest
+from vpd_lightning.data.trained_on import DATA_SHA256, TRAINED_ON
 from vpd_lightning.training.checkpoint_files import load_checkpoint, write_checkpoint
 from vpd_lightning.training.checkpoints import find_resume
 

@@ -28,10 +28,11 @@ HELP = """vpd-data: make, bring in, look at and check data sets of posed RGB-D v
 
   vpd-data validate FOLDER
       Check every file and checksum, and whether depths and poses of the views agree; names each fault, and the
-      convention that would make disagreeing views agree.
+      convention that would make disagreeing views agree. vpd-train refuses what failed, and imports never validated.
 
   vpd-data split FOLDER train=0.8 validation=0.1 test=0.1 [seed=0]
-      Divide the recordings of a data set anew (shares or counts); pieces of one recording stay together.
+      Divide the recordings of a data set anew (shares or counts); pieces of one recording stay together. Before
+      the training: vpd-eval refuses what was trained on.
 
 Examples
   vpd-data generate scene=mujoco_block preset=demo out=datasets/mujoco_block_demo

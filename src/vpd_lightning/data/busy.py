@@ -31,30 +31,32 @@ def busy_error(path: Path, error: BaseException) -> BrokenFileError | None:
 
 def _programs(path: Path, *, writing: bool) -> list[str]:
     """Name the processes that have a file open (for writing), as far as this system tells (Linux does)."""
+    wanted = str(path.resolve())
     try:
-        wanted = path.stat()
-        processes = [entry for entry in os.scandir("/proc") if entry.name.isdigit()]
+        processes = [name for name in os.listdir("/proc") if name.isdigit()]
     except OSError:
         return []
-    return [_name(int(entry.name)) for entry in processes if _holds(Path(entry.path), wanted, writing=writing)]
+    return [_name(int(process)) for process in processes if _holds(process, wanted, writing=writing)]
 
 
-def _holds(process: Path, wanted: os.stat_result, *, writing: bool) -> bool:
+def _holds(process: str, wanted: str, *, writing: bool) -> bool:
+    """Compare names: nothing that a process has open is touched, which could be a disk that does not answer."""
+    folder = f"/proc/{process}/fd"
     try:
-        handles = list((process / "fd").iterdir())
+        handles = os.listdir(folder)
     except OSError:  # ended meanwhile, or another user's
         return False
     for handle in handles:
         try:
-            if os.path.samestat(handle.stat(), wanted) and (not writing or _writes(process / "fdinfo" / handle.name)):
+            if os.readlink(f"{folder}/{handle}") == wanted and (not writing or _writes(f"{folder}info/{handle}")):
                 return True
         except OSError:
             continue
     return False
 
 
-def _writes(facts: Path) -> bool:
-    flags = next(line for line in facts.read_text().splitlines() if line.startswith("flags:"))
+def _writes(facts: str) -> bool:
+    flags = next(line for line in Path(facts).read_text().splitlines() if line.startswith("flags:"))
     return int(flags.split()[1], 8) & os.O_ACCMODE != os.O_RDONLY
 
 

@@ -14,10 +14,6 @@ from vpd_lightning.files import AtomicPath
 
 FILE_NAME = "dataset.json"
 UNFINISHED_NAME = ".unfinished.json"  # what a data set in the making was asked to be
-DATA_SHA256 = "data_sha256"
-"""Where a checkpoint keeps the digests of the data sets it was trained on: more than one if it went on with another."""
-TRAINED_ON = "trained_on_sha256"
-"""Where a checkpoint or a released model keeps the SHA-256 of each trajectory that a training saw; null: not known."""
 SPLITS = ("train", "validation", "test")
 _MAX_BYTES = 64 * 2**20
 _MAX_TRAJECTORIES = 400_000

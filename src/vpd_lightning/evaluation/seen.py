@@ -24,12 +24,13 @@ def seen_in_training(
         return {"trajectories": None, "of": len(paths)}
     seen = [path for path, checksum in zip(paths, manifest.checksums(paths), strict=True) if checksum in trained_on]
     if seen and protocol.split != "train" and not force:
-        backup = manifest.folder / BACKUP_NAME
-        back = f"go back to the division before: cp {backup} {manifest.folder / FILE_NAME}; " if backup.exists() else ""
+        backup, index = manifest.folder / BACKUP_NAME, manifest.folder / FILE_NAME
+        first_one = f"Go back to its first division, cp {backup} {index}\n" if backup.is_file() else ""
         raise DataError(
             f"{len(seen)} of the {len(paths)} trajectories of split {protocol.split} were trained on, first "
             f"{manifest.relative(seen[0])}.\n"
-            f"Was {manifest.folder} divided anew after the training? Then its figures say nothing of new videos.\n"
-            f"Evaluate on other data (data.folder=FOLDER); {back}or, marked as such: force=true, protocol.split=train"
+            f"Was {manifest.folder} divided anew after the training? These figures would say nothing of new videos.\n"
+            f"{first_one}Evaluate other data: data.folder=FOLDER\n"
+            "Or measure these on purpose, marked as such: protocol.split=train, or force=true"
         )
     return {"trajectories": len(seen), "of": len(paths)}

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn import functional
-from torch_geometric.utils import segment
 
 
 @dataclass(frozen=True)
@@ -135,6 +134,8 @@ def _sums(
         # Three to ten times faster than segment sums there, with threads, and in the same order.
         ordered = torch.arange(len(edges)) if order is None else order
         return functional.embedding_bag(ordered, values, offsets, mode="sum", include_last_offset=True).to(edges.dtype)
+    from torch_geometric.utils import segment  # takes seconds to import, and is not needed above
+
     return segment(values if order is None else values.index_select(0, order), offsets, reduce="sum").to(edges.dtype)
 
 

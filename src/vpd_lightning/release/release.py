@@ -10,7 +10,7 @@ import torch
 import yaml
 from torch import Tensor, nn
 
-from vpd_lightning.data.manifest import TRAINED_ON
+from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.errors import CheckpointError, ConfigError
 from vpd_lightning.release.model_card import CardContent, model_card
 from vpd_lightning.release.portable import absolute_paths, portable_config, portable_metrics

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from vpd_lightning.data.manifest import TRAINED_ON
+from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.errors import CheckpointError
 from vpd_lightning.release.portable import absolute_paths
 

@@ -2,27 +2,28 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import yaml
 
-from vpd_lightning.data.manifest import DATA_SHA256, Manifest
+from vpd_lightning.data.manifest import Manifest
+from vpd_lightning.data.trained_on import DATA_SHA256
 from vpd_lightning.errors import ConfigError, OutOfMemoryError
-from vpd_lightning.evaluation.evaluate import Evaluation, evaluate
-from vpd_lightning.evaluation.prediction import PredictsVideo, PredictsViews
 from vpd_lightning.evaluation.protocol import Protocol
-from vpd_lightning.evaluation.report import metrics_of, write_metrics
-from vpd_lightning.evaluation.rollouts import MAX_CLIPS, write_rollouts
 from vpd_lightning.evaluation.seen import seen_in_training
 from vpd_lightning.evaluation.summary import summary_lines
-from vpd_lightning.evaluation.web_page import write_web_page
 from vpd_lightning.files import OutputFolder, choose_folder
 from vpd_lightning.loading import LoadedModel, load_model
 from vpd_lightning.release.results_folder import beside_checkpoint
 from vpd_lightning.runs.one_recording import data_set
 from vpd_lightning.runs.progress import show_progress
 from vpd_lightning.runs.threads import set_threads
+
+if TYPE_CHECKING:
+    from vpd_lightning.evaluation.evaluate import Evaluation
+
+# What measures and draws is imported where it is used: the first line shall not wait for it.
 
 _DEFAULT_SYSTEM = "vpd"  # checkpoints from before there were others do not say
 
@@ -37,25 +38,16 @@ def run_evaluation(config: Mapping[str, Any]) -> Path:
         raise ConfigError(f"num_videos={config['num_videos']} is out of range.\nAllowed: 0 or more.")
     set_threads(config["num_threads"])
     model = load_model(config["ckpt"], config["device"], config["change"], sleeping=config["sleeping"])
-    _require_predictions(model)
     protocol = choose_protocol(config["protocol"], model.config.get("protocol"))
     manifest = data_set(config["data"]["folder"], model.config)
     seen = seen_in_training(manifest, protocol, model.trained_on, force=config["force"])
     name = "evaluation" if protocol.split == "test" else f"evaluation_{protocol.split}"
     folder = choose_folder(config["out"], beside_checkpoint(model.path, name))
     print(f"{model.name}, step {model.step}: {model.path}", flush=True)
+    _require_predictions(model)
     with OutputFolder(folder) as partial:
-        evaluation = _evaluate(model, manifest, protocol, config)
-        metrics = metrics_of(evaluation, protocol, {**_identity(model, manifest, config), "seen_in_training": seen})
-        from vpd_lightning.evaluation.gallery import write_gallery  # matplotlib: not before it is needed
-
-        write_gallery(partial, metrics, evaluation, config["num_videos"])
-        write_rollouts(partial / "rollouts.npz", evaluation)
-        if model.checkpoint is not None:
-            _write_config(partial / "config.yaml", model.checkpoint["hyper_parameters"])
-        metrics["training"] = None if model.checkpoint is None else training_of(model.checkpoint, model.path)
-        path = folder / write_metrics(partial, metrics, evaluation).name
-        write_web_page(partial, metrics)
+        metrics = _write_evaluation(partial, model, manifest, protocol, config, seen)
+    path = folder / "metrics.json"
     print("\n".join(summary_lines(metrics)))
     print()
     print(path)
@@ -76,7 +68,35 @@ def choose_protocol(wanted: Mapping[str, Any], of_run: Mapping[str, Any] | None)
     return Protocol(**{key: values[key] for key in wanted})
 
 
+def _write_evaluation(
+    folder: Path,
+    model: LoadedModel,
+    manifest: Manifest,
+    protocol: Protocol,
+    config: Mapping[str, Any],
+    seen: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Evaluate, write all files, and return the content of ``metrics.json``."""
+    from vpd_lightning.evaluation.gallery import write_gallery
+    from vpd_lightning.evaluation.report import metrics_of, write_metrics
+    from vpd_lightning.evaluation.rollouts import write_rollouts
+    from vpd_lightning.evaluation.web_page import write_web_page
+
+    evaluation = _evaluate(model, manifest, protocol, config)
+    metrics = metrics_of(evaluation, protocol, {**_identity(model, manifest, config), "seen_in_training": seen})
+    write_gallery(folder, metrics, evaluation, config["num_videos"])
+    write_rollouts(folder / "rollouts.npz", evaluation)
+    if model.checkpoint is not None:
+        _write_config(folder / "config.yaml", model.checkpoint["hyper_parameters"])
+    metrics["training"] = None if model.checkpoint is None else training_of(model.checkpoint, model.path)
+    write_metrics(folder, metrics, evaluation)
+    write_web_page(folder, metrics)
+    return metrics
+
+
 def _require_predictions(model: LoadedModel) -> None:
+    from vpd_lightning.evaluation.prediction import PredictsVideo, PredictsViews
+
     if not isinstance(model.simulator, PredictsVideo | PredictsViews):
         raise ConfigError(
             f"{model.path} holds a {type(model.simulator).__name__}, which predicts no video.\n"
@@ -84,7 +104,10 @@ def _require_predictions(model: LoadedModel) -> None:
         )
 
 
-def _evaluate(model: LoadedModel, manifest: Manifest, protocol: Protocol, config: Mapping[str, Any]) -> Evaluation:
+def _evaluate(model: LoadedModel, manifest: Manifest, protocol: Protocol, config: Mapping[str, Any]) -> "Evaluation":
+    from vpd_lightning.evaluation.evaluate import evaluate
+    from vpd_lightning.evaluation.rollouts import MAX_CLIPS
+
     num_kept = max(config["num_videos"], MAX_CLIPS)
     try:
         with show_progress() as progress:

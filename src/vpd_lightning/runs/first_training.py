@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from vpd_lightning.config import pretraining_config
 from vpd_lightning.config.migrations import upgraded
 from vpd_lightning.config.pretraining import FOLDER
-from vpd_lightning.data.manifest import TRAINED_ON
+from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.data.views.slot_store import INDEX_FILE
 from vpd_lightning.data.views.view_datamodule import FOLDER as SLOTS
 from vpd_lightning.errors import CheckpointError, ConfigError

@@ -9,7 +9,7 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor, nn
 
-from vpd_lightning.data.manifest import DATA_SHA256, TRAINED_ON
+from vpd_lightning.data.trained_on import DATA_SHA256, TRAINED_ON
 from vpd_lightning.data.validation import VideoClip
 from vpd_lightning.errors import ConfigError, NonFiniteError
 from vpd_lightning.losses.base import AbstractLoss
