@@ -3,11 +3,19 @@
 import numpy as np
 import pytest
 
-from vpd_lightning.comparison.bootstrap import Estimate, Sums, difference, estimate, stacked, step_band, sums_of
+from vpd_lightning.comparison.bootstrap import (
+    Estimate,
+    MetricSamples,
+    difference,
+    estimate,
+    stacked,
+    step_band,
+    sums_of,
+)
 from vpd_lightning.evaluation.statistics import summarize
 
 
-def measured(values: np.ndarray, trajectory: np.ndarray | None = None) -> Sums:
+def measured(values: np.ndarray, trajectory: np.ndarray | None = None) -> MetricSamples:
     return stacked([sums_of(values, np.arange(len(values)) if trajectory is None else trajectory)])
 
 

@@ -10,7 +10,7 @@ import yaml
 
 from tests.comparison.made_runs import MakeRun
 from vpd_lightning.comparison.collect import collect
-from vpd_lightning.comparison.comparison_table import boards_of
+from vpd_lightning.comparison.comparison_table import comparison_tables
 from vpd_lightning.errors import ConfigError, DataError
 
 
@@ -108,7 +108,7 @@ def test_an_evaluation_without_depth_is_a_row_of_its_own(make_run: MakeRun, tmp_
 
     found = collect([tmp_path / "runs"], "test")
 
-    [board] = boards_of(found.runs)
+    [board] = comparison_tables(found.runs)
     assert found.left_out == []
     assert sorted(row.name for row in board.rows) == ["vpd", "vpd (hide_depth=true)"]
     assert [row.name for row in board.main_rows] == ["vpd"]
@@ -139,18 +139,18 @@ def test_a_run_without_arrays_is_kept(make_run: MakeRun, tmp_path: Path):
 
     run = collect([tmp_path / "runs"], "test").runs[0]
 
-    assert run.sums == {} and run.metrics["psnr"]["mean"] > 0
+    assert run.samples == {} and run.metrics["psnr"]["mean"] > 0
 
 
 def test_the_sums_give_the_printed_means(make_run: MakeRun, tmp_path: Path):
     make_run("a")
     run = collect([tmp_path / "runs"], "test").runs[0]
 
-    for (source, name), (total, count) in run.sums.items():
+    for (source, name), (total, count) in run.samples.items():
         place = run.metrics if source == "model" else run.metrics["references"][source]
         summary = (place.get(name) or (place.get("motion") or {}).get(name))["mean"]
         assert np.sum(total) / np.sum(count) == pytest.approx(summary, rel=1e-12)
-    assert {name for source, name in run.sums if source == "model"} >= {"psnr", "ssim", "centroid_error", "chamfer"}
+    assert {name for source, name in run.samples if source == "model"} >= {"psnr", "ssim", "centroid_error", "chamfer"}
 
 
 def test_nothing_found_says_what_to_do(tmp_path: Path, make_run: MakeRun):

@@ -9,18 +9,18 @@ import yaml
 
 from tests.comparison.made_runs import MakeRun
 from vpd_lightning.comparison.collect import collect
-from vpd_lightning.comparison.comparison_table import Board, boards_of
-from vpd_lightning.comparison.measure import BY_NAME
+from vpd_lightning.comparison.comparison_table import ComparisonTable, comparison_tables
 from vpd_lightning.comparison.paired_differences import paired_differences, standing, told_apart
 from vpd_lightning.comparison.settings import comparable_settings, naming_keys
 from vpd_lightning.comparison.sweep import sweeps_of
 from vpd_lightning.comparison.tables import systems_table, winners
-from vpd_lightning.comparison.warnings import board_warnings, parted_experiments
+from vpd_lightning.comparison.warnings import parted_experiments, table_warnings
 from vpd_lightning.data.manifest import Manifest, write_manifest
+from vpd_lightning.metrics.registry import metric
 
 
-def boards(tmp_path: Path) -> list[Board]:
-    return boards_of(collect([tmp_path / "runs"], "test").runs)
+def boards(tmp_path: Path) -> list[ComparisonTable]:
+    return comparison_tables(collect([tmp_path / "runs"], "test").runs)
 
 
 def test_seeds_share_a_row_and_systems_keep_the_papers_order(make_run: MakeRun, tmp_path: Path):
@@ -53,7 +53,7 @@ def test_one_seed_has_the_printed_interval(make_run: MakeRun, tmp_path: Path):
     [board] = boards(tmp_path)
 
     for name in ("psnr", "psnr_moving", "ssim", "centroid_error", "chamfer"):
-        summary = BY_NAME[name].summary(board.runs[0].metrics)
+        summary = metric(name).summary(board.runs[0].metrics)
         found = board.rows[0].estimate(name)
         assert summary and found and found.interval == pytest.approx(summary["ci95"], rel=1e-9)
 
@@ -74,7 +74,7 @@ def test_other_data_and_other_protocols_get_their_own_table(make_run: MakeRun, t
     assert len({board.title for board in found}) == 3
     assert "must not be compared" in parted_experiments(found)[0]
     together = next(board for board in found if len(board.rows) == 2)
-    assert any("do not look through the same cameras" in words for words in board_warnings(together))
+    assert any("do not look through the same cameras" in words for words in table_warnings(together))
 
 
 def test_differing_budgets_and_seeds_are_told(make_run: MakeRun, tmp_path: Path):
@@ -82,7 +82,7 @@ def test_differing_budgets_and_seeds_are_told(make_run: MakeRun, tmp_path: Path)
     make_run("a1", minutes=60.0, seed=1)
     make_run("b", system="global", minutes=None)
 
-    words = " ".join(board_warnings(boards(tmp_path)[0]))
+    words = " ".join(table_warnings(boards(tmp_path)[0]))
 
     assert "budgets of the systems differ: global 500 steps; vpd 60 min cpu" in words
     assert "global 1, vpd 2" in words
@@ -94,7 +94,7 @@ def test_training_on_other_data_than_the_evaluation_is_told(make_run: MakeRun, t
         path = run / "evaluation" / "metrics.json"
         path.write_text(json.dumps({**json.loads(path.read_text()), "training": {"data_sha256": digest}}))
 
-    (words,) = [words for words in board_warnings(boards(tmp_path)[0]) if "trained on another data set" in words]
+    (words,) = [words for words in table_warnings(boards(tmp_path)[0]) if "trained on another data set" in words]
 
     assert str(other) in words and str(same) not in words
 
@@ -103,7 +103,7 @@ def test_same_budgets_warn_of_nothing(make_run: MakeRun, tmp_path: Path):
     make_run("a")
     make_run("b", system="global")
 
-    assert board_warnings(boards(tmp_path)[0]) == []
+    assert table_warnings(boards(tmp_path)[0]) == []
 
 
 def test_what_was_trained_on_is_marked_and_so_is_what_nobody_knows(make_run: MakeRun, tmp_path: Path):
@@ -111,7 +111,7 @@ def test_what_was_trained_on_is_marked_and_so_is_what_nobody_knows(make_run: Mak
     change_json(seen / "evaluation" / "metrics.json", seen_in_training={"trajectories": 2, "of": 3})
     change_json(old / "evaluation" / "metrics.json", seen_in_training=None)
 
-    trained, unknown = (line for line in board_warnings(boards(tmp_path)[0]) if "trained on what" in line)
+    trained, unknown = (line for line in table_warnings(boards(tmp_path)[0]) if "trained on what" in line)
     assert f"{seen} (2 trajectories)" in trained and str(old) in unknown and "not known" in unknown
     assert str(new) not in trained + unknown
 
@@ -211,15 +211,15 @@ def test_the_best_stands_alone_only_where_no_interval_reaches_it(make_run: MakeR
     make_run("c", system="sequential", psnr=10.0)
     [board] = boards(tmp_path)
 
-    place = standing(board.main_rows, BY_NAME["psnr"])
+    place = standing(board.main_rows, metric("psnr"))
 
     assert place is not None and place.best.system == "vpd"
     assert [row.system for row in place.within] == ["global"]
     # The same clips were hard for both, so that the pairs tell what the intervals cannot.
     assert [row.system for row in told_apart(place, 200)] == ["global"]
-    sharp = standing(board.main_rows, BY_NAME["sharpness"])
+    sharp = standing(board.main_rows, metric("sharpness"))
     assert sharp is not None and sharp.best.system == "vpd"
-    assert standing(board.main_rows, BY_NAME["penetration"]) is None
+    assert standing(board.main_rows, metric("penetration")) is None
 
 
 def test_paired_differences_are_those_of_the_means(make_run: MakeRun, tmp_path: Path):
@@ -245,7 +245,7 @@ def test_nobody_is_best_where_budgets_differ(make_run: MakeRun, tmp_path: Path):
     make_run("b", system="global", minutes=30.0)
     [board] = boards(tmp_path)
 
-    assert standing(board.main_rows, BY_NAME["psnr"]) is None
+    assert standing(board.main_rows, metric("psnr")) is None
     assert winners(board) == ["No system is called best, here and in the tables: their training budgets differ."]
     assert "**" not in "".join(systems_table(board))
 
@@ -285,7 +285,7 @@ def test_settings_and_time_are_those_of_the_checkpoint(make_run: MakeRun, tmp_pa
     [board] = boards(tmp_path)
 
     assert (board.runs[0].declared_budget, board.runs[0].minutes) == ("90 min cpu", 80.0)
-    assert any("ended before their time budget" in words and "80.0 of 90" in words for words in board_warnings(board))
+    assert any("ended before their time budget" in words and "80.0 of 90" in words for words in table_warnings(board))
 
 
 def test_unknown_times_and_other_checkpoints_are_told(make_run: MakeRun, tmp_path: Path):
@@ -294,7 +294,7 @@ def test_unknown_times_and_other_checkpoints_are_told(make_run: MakeRun, tmp_pat
     change_json(run / "evaluation" / "metrics.json", checkpoint="x/last.ckpt")
     change_json(make_run("b", system="global") / "evaluation" / "metrics.json", checkpoint="y/best.ckpt")
 
-    words = " ".join(board_warnings(boards(tmp_path)[0]))
+    words = " ".join(table_warnings(boards(tmp_path)[0]))
 
     assert f"not known how long these trained: {run}" in words
     assert "checkpoints was evaluated: global best.ckpt; vpd last.ckpt" in words
@@ -307,7 +307,7 @@ def test_what_sets_the_pace_counts_under_a_time_budget(make_run: MakeRun, tmp_pa
     change_json(other / "environment.json", devices=["cpu: other"])
     [board] = boards(tmp_path)
 
-    words = " ".join(board_warnings(board))
+    words = " ".join(table_warnings(board))
 
     assert "did not compute alike: global num_threads=4; vpd num_threads=1" in words
     assert "different machines: global cpu: other; vpd cpu: one" in words
@@ -316,6 +316,6 @@ def test_what_sets_the_pace_counts_under_a_time_budget(make_run: MakeRun, tmp_pa
 
 
 def test_sharpness_is_ranked_by_its_ratio():
-    distance = BY_NAME["sharpness"].distance
+    distance = metric("sharpness").distance
     assert distance(0.5) == pytest.approx(distance(2.0)) and distance(0.4) > distance(2.0) > distance(1.1)
     assert distance(0.0) > 10

@@ -112,8 +112,8 @@ def test_a_clip_counts_the_same_in_any_company(manifest: Manifest, evaluation: E
         assert alone.clips == evaluation.clips[rows]
         for name, values in alone.images["model"].items():
             assert np.array_equal(values, evaluation.images["model"][name][rows], equal_nan=True), name
-        for name, values in alone.penetration.items():
-            assert np.array_equal(values, evaluation.penetration[name][rows], equal_nan=True), name
+        for name, values in alone.blocks["penetration"].items():
+            assert np.array_equal(values, evaluation.blocks["penetration"][name][rows], equal_nan=True), name
 
 
 def test_trajectories_with_more_clips_weigh_more_in_the_mean_and_the_same_in_the_bootstrap() -> None:

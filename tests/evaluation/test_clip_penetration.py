@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from tests.evaluation.conftest import protocol_with
-from tests.evaluation.tossed_box import FLOOR_HEIGHT, HALF_SIZE, Oracle
+from tests.evaluation.tossed_box import FLOOR_HEIGHT, HALF_SIZE, Oracle, clip_penetration
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.evaluation.bodies import Body, find_bodies
 from vpd_lightning.evaluation.evaluate import evaluate
-from vpd_lightning.evaluation.penetration import clip_penetration, floor_height
+from vpd_lightning.evaluation.penetration import floor_height
 from vpd_lightning.evaluation.report import metrics_of
 from vpd_lightning.simulator import Scene
 from vpd_lightning.types import Particles
@@ -51,7 +51,7 @@ def test_a_body_that_sinks_is_measured_from_its_deepest_particle(manifest: Manif
     lowest = evaluation.motion["lowest_point"][0, 0]
     expected = np.maximum(FLOOR_HEIGHT - lowest, 0)
     assert expected[-1] > 0.3
-    np.testing.assert_allclose(evaluation.penetration["mean"][0, 0], expected, atol=1e-6)
+    np.testing.assert_allclose(evaluation.blocks["penetration"]["mean"][0, 0], expected, atol=1e-6)
     penetration = metrics_of(evaluation, protocol, {})["penetration"]
     assert penetration["mean"] == penetration["floor"] == pytest.approx(expected.mean(), abs=1e-6)
     assert penetration["bodies"] is None, "there is no other body"
@@ -87,7 +87,7 @@ def test_particles_in_another_bodys_true_box_are_measured_to_its_nearest_face(cl
     assert bodies[0].mask.all() and not bodies[1].mask.any()
     moved = bodies[0].true.clone()
     moved[1:, :, 0] += torch.tensor([0.0, 0.1, 0.15, 0.3])[:, None]  # the other box begins 0.1 m away
-    depths = clip_penetration(clip, bodies, moved, 5)
+    depths = clip_penetration(clip, bodies, moved)
     np.testing.assert_allclose(depths["bodies"][0].numpy(), [0.0, 0.0, 0.05, 0.15], atol=1e-6)  # 0.15: a half size
     np.testing.assert_allclose(depths["mean"][0].numpy(), depths["bodies"][0].numpy())
     assert (depths["true_motion"][0] == 0).all()
@@ -98,7 +98,7 @@ def test_what_two_boxes_share_from_the_start_is_no_penetration(clip: Clip) -> No
     clip = two_boxes(clip)
     start = particles_of(clip, 0)
     shared = Body(torch.ones(10, dtype=torch.bool), start.expand(5, -1, -1), None, start)
-    depths = clip_penetration(clip, [shared, shared], start.expand(5, -1, -1), 5)
+    depths = clip_penetration(clip, [shared, shared], start.expand(5, -1, -1))
     assert (depths["bodies"] == 0).all()
 
 
@@ -107,6 +107,6 @@ def test_what_is_not_finite_or_behind_the_recording_has_no_depth(clip: Clip) -> 
     bodies = find_bodies(clip, particles_of(clip, 0), 0.02, 20)
     positions = particles_of(clip, 0).repeat(21, 1, 1)
     positions[2] = torch.nan
-    depths = clip_penetration(clip, bodies, positions, 5)
+    depths = clip_penetration(clip, bodies, positions)
     assert depths["mean"][0].isnan().nonzero().flatten().tolist() == [1]
     assert depths["bodies"][0].isfinite().sum() == 7 and depths["true_motion"][0].isfinite().sum() == 8

@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from tests.evaluation.soft_ball import RADIUS, SoftScene, write_soft_ball
-from tests.evaluation.tossed_box import NUM_FRAMES
+from tests.evaluation.tossed_box import NUM_FRAMES, clip_penetration
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.ground_truth import read_positions, read_state
 from vpd_lightning.errors import DataError
 from vpd_lightning.evaluation.bodies import find_bodies
 from vpd_lightning.evaluation.motion import clip_motion
-from vpd_lightning.evaluation.penetration import clip_penetration
 
 START, MARGIN = 1, 0.02
 FIRST = START + 1  # the last input frame
@@ -93,7 +92,7 @@ def test_soft_bodies_have_no_box_to_penetrate(scene: SoftScene, clip: Clip) -> N
     bodies = find_bodies(clip, positions[0], MARGIN, 5)
     into_box = positions.clone()
     into_box[1:, : scene.surface.shape[1]] = clip.poses(5)[1:, :1, :3]  # the middle of the rigid box
-    depths = clip_penetration(clip, bodies, into_box, 5)
+    depths = clip_penetration(clip, bodies, into_box)
     np.testing.assert_allclose(depths["bodies"][1].numpy(), 0.15, atol=1e-9)  # the box's smallest half size
     assert depths["bodies"][0].isnan().all(), "nothing shows the box here"
 

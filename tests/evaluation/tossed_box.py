@@ -5,14 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from tests.data.recordings import write_dataset_file
+from vpd_lightning.data.clip import Clip
 from vpd_lightning.data.ground_truth import GroundTruth, read_state
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.data.schema import Trajectory, write_trajectory
+from vpd_lightning.evaluation.bodies import Body
+from vpd_lightning.evaluation.motion import body_tracks
 from vpd_lightning.geometry.cameras import unproject
+from vpd_lightning.metrics.body_track import measure_bodies
+from vpd_lightning.metrics.registry import metric
 from vpd_lightning.metrics.rigid_motion import inside_box, move_with_body
 from vpd_lightning.simulator import Scene
 from vpd_lightning.types import Cameras, Particles
@@ -164,3 +171,10 @@ class Swaying(Oracle):
 
     def render(self, states: Sequence[Particles], cameras: Cameras) -> torch.Tensor:
         return 0.9 * super().render(states, cameras)
+
+
+def clip_penetration(
+    clip: Clip, bodies: Sequence[Body], positions: Float[Tensor, "time particle 3"]
+) -> dict[str, Float[Tensor, "object step"]]:
+    """Depth of every body's deepest particle in what is solid, by part."""
+    return measure_bodies(metric("penetration"), body_tracks(clip, bodies, positions, None))

@@ -24,14 +24,14 @@ def test_mean_over_steps_points_and_features_and_that_near_particles():
     value = loss(output_of([2.0, 0.2, 0.1, 0.0]), video_batch(2))
 
     assert float(value) == pytest.approx(0.36 / 12)
-    assert float(loss.measured["point_features_near"]) == pytest.approx(0.36 / 6)  # the first two of four points
+    assert float(loss.metrics["point_features_near"]) == pytest.approx(0.36 / 6)  # the first two of four points
 
 
 def test_no_point_near_particles():
     loss = PointFeatureLoss(weight=1.0, min_mass=5.0)
 
     assert float(loss(output_of([2.0, 0.2, 0.1, 0.0]), video_batch(2))) > 0
-    assert float(loss.measured["point_features_near"]) == 0.0
+    assert float(loss.metrics["point_features_near"]) == 0.0
 
 
 def test_other_systems_are_told_where_it_belongs():

@@ -30,7 +30,7 @@ def test_mean_square_and_mean_distance_in_metres():
     predicted[1, 0] = 1.0  # one metre too near in another
 
     assert float(loss(output_of(predicted), batch)) == pytest.approx((0.25 + 1.0) / 4)
-    assert float(loss.measured["predicted_depth_error"]) == pytest.approx((0.5 + 1.0) / 4)
+    assert float(loss.metrics["predicted_depth_error"]) == pytest.approx((0.5 + 1.0) / 4)
 
 
 @pytest.mark.parametrize("unmeasured", [0.0, -1.0, float("nan"), float("inf"), 5.1])

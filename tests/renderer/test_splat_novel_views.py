@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.renderer.test_splat import renderer
-from vpd_lightning.metrics import psnr
+from vpd_lightning.metrics.psnr import psnr
 from vpd_lightning.types import Particles, Rays
 
 RADIUS, SIDE, BEHIND = 0.5, 24, 0.2

@@ -15,6 +15,18 @@ from tests.training.tiny_training import tiny_data, tiny_module, tiny_simulator,
 from tests.waiting import HANG
 
 
+class KeepScores(pl.Callback):
+    """Saves what a validation found, as it is monitored and logged."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if trainer.is_global_zero:
+            scores = {name: value for name, value in trainer.callback_metrics.items() if name.startswith("validation/")}
+            torch.save(scores, self.path)
+
+
 class KeepGradients(pl.Callback):
     """Saves the gradients of the second step, after they were averaged over the processes."""
 
@@ -32,9 +44,13 @@ def train(data: Path, run: Path, devices: int) -> None:
     torch.set_num_threads(1)
     # Forked processes, because they need not import everything again; the strategy is the same.
     strategy = "ddp_fork" if devices > 1 else "auto"
+    data_of = tiny_data(data, batch_size=4)
+    tiny_trainer(run, 2, [KeepScores(run / "untrained.pt")], devices=devices, strategy=strategy).validate(
+        tiny_module(tiny_simulator(torch.float64)), data_of, verbose=False
+    )
     callbacks: list[pl.Callback] = [KeepGradients(run / "gradients.pt")]
     trainer = tiny_trainer(run, 2, callbacks, devices=devices, strategy=strategy, val_check_interval=2)
-    trainer.fit(tiny_module(tiny_simulator(torch.float64)), tiny_data(data, batch_size=4))
+    trainer.fit(tiny_module(tiny_simulator(torch.float64)), data_of)
 
 
 @pytest.mark.slow
@@ -49,6 +65,10 @@ def test_two_processes_give_the_gradients_and_the_validation_of_one(tmp_path: Pa
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=HANG, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     gradients = [torch.load(tmp_path / run / "gradients.pt", weights_only=True) for run in ("one", "two")]
+    untrained = [torch.load(tmp_path / run / "untrained.pt", weights_only=True) for run in ("one", "two")]
+    assert set(untrained[0]) == {"validation/psnr", "validation/psnr_last_step"}
+    # The same weights in both: bit for bit, whichever process predicted which clip.
+    assert untrained[0] == untrained[1]
     scores = [(tmp_path / run / "metrics.csv").read_text().split(",")[-2:] for run in ("one", "two")]
     assert gradients[0].keys() == gradients[1].keys() and len(gradients[0]) == 6
     for name, expected in gradients[0].items():

@@ -11,6 +11,7 @@ from typing import Any
 
 from vpd_lightning.commands.report_errors import run_command
 from vpd_lightning.errors import ConfigError, RenderingBackendError
+from vpd_lightning.metrics.registry import HEADLINE, metric
 from vpd_lightning.release.release_folder import list_releases
 from vpd_lightning.runs.environment import DISTRIBUTION, devices, git_commit, requirements, version_of
 
@@ -128,10 +129,10 @@ def render(report: dict[str, Any]) -> str:
 def _released_line(entry: Mapping[str, Any]) -> str:
     if entry["fault"]:
         return f"{entry['folder']:32} {entry['fault']}"
-    psnr = "" if entry.get("psnr") is None else f"  PSNR {entry['psnr']:.2f} dB"
+    score = "" if entry.get(HEADLINE) is None else f"  {metric(HEADLINE).spoken(entry[HEADLINE])}"
     return (
         f"{entry['folder']:32} {entry['system']}, {entry['experiment']}, {entry['num_parameters']:,} parameters, "
-        f"{entry['bytes'] / 1e6:.1f} MB{psnr}"
+        f"{entry['bytes'] / 1e6:.1f} MB{score}"
     )
 
 

@@ -12,8 +12,8 @@ _TRAJECTORIES, _SEEDS_FIRST, _SEEDS_SECOND = 0, 1, 2
 
 
 @dataclass(frozen=True)
-class Sums:
-    """One measure of several seeds of one system: sums and counts of its known values.
+class MetricSamples:
+    """What one metric gave for several seeds of one system: sums and counts of its known values.
 
     Axes ``seed trajectory step``. Means weigh every value (every image) of a seed the same, and every seed the same.
     """
@@ -30,10 +30,10 @@ class Sums:
         """The mean of each step; NaN where some seed has no value."""
         return _ratio(self.total.sum(1), self.count.sum(1)).mean(0)
 
-    def only(self, kept: Bool[np.ndarray, "trajectory step"]) -> "Sums":
+    def only(self, kept: Bool[np.ndarray, "trajectory step"]) -> "MetricSamples":
         """The same with some of its values, of the trajectories that have any left."""
         rows = kept.any(1)
-        return Sums(np.where(kept, self.total, 0.0)[:, rows], np.where(kept, self.count, 0)[:, rows])
+        return MetricSamples(np.where(kept, self.total, 0.0)[:, rows], np.where(kept, self.count, 0)[:, rows])
 
     def known(self) -> Bool[np.ndarray, "trajectory step"]:
         """Which steps of which trajectories have values in every seed."""
@@ -67,32 +67,34 @@ def sums_of(values: NDArray[np.floating], trajectory: NDArray[np.int64]) -> tupl
     return np.stack([total[row].sum(0) for row in rows]), np.stack([count[row].sum(0) for row in rows])
 
 
-def estimate(sums: Sums, num_bootstrap: int) -> Estimate | None:
+def estimate(samples: MetricSamples, num_bootstrap: int) -> Estimate | None:
     """Estimate the mean; the interval is the percentile bootstrap (Efron 1979) over trajectories and seeds.
 
     Each replicate draws as many trajectories as there are, with replacement and the same for all seeds, and as many
     seeds as there are. With one seed it says how much the score depends on the trajectories only, and is the ``ci95``
     of ``metrics.json`` where every trajectory has values. Two or three seeds understate how much seeds differ.
     """
-    mean = sums.mean()
+    mean = samples.mean()
     if mean is None:
         return None
-    return Estimate(mean, _interval(_replicates(sums, num_bootstrap, _SEEDS_FIRST)))
+    return Estimate(mean, _interval(_replicates(samples, num_bootstrap, _SEEDS_FIRST)))
 
 
-def step_band(sums: Sums, num_bootstrap: int) -> Float[np.ndarray, "2 step"]:
+def step_band(samples: MetricSamples, num_bootstrap: int) -> Float[np.ndarray, "2 step"]:
     """Lower and upper end of the interval of each step; NaN where there is none."""
-    num_steps = sums.total.shape[2]
+    num_steps = samples.total.shape[2]
     ends = [
         _interval(
-            _replicates(Sums(sums.total[..., i : i + 1], sums.count[..., i : i + 1]), num_bootstrap, _SEEDS_FIRST)
+            _replicates(
+                MetricSamples(samples.total[..., i : i + 1], samples.count[..., i : i + 1]), num_bootstrap, _SEEDS_FIRST
+            )
         )
         for i in range(num_steps)
     ]
     return np.array([(np.nan, np.nan) if end is None else end for end in ends]).T
 
 
-def difference(first: Sums, second: Sums, num_bootstrap: int) -> tuple[Estimate, int] | None:
+def difference(first: MetricSamples, second: MetricSamples, num_bootstrap: int) -> tuple[Estimate, int] | None:
     """Estimate first minus second over the steps of trajectories that both know, and the number of trajectories.
 
     The same trajectories are drawn for both, because both saw the same clips: what makes a clip hard for both does not
@@ -107,17 +109,17 @@ def difference(first: Sums, second: Sums, num_bootstrap: int) -> tuple[Estimate,
     return Estimate(means[0] - means[1], _interval(replicates)), int(shared.any(1).sum())
 
 
-def stacked(parts: Sequence[tuple[NDArray, NDArray]]) -> Sums:
-    """Put the sums of several seeds together."""
-    return Sums(np.stack([total for total, _ in parts]), np.stack([count for _, count in parts]))
+def stacked(parts: Sequence[tuple[NDArray, NDArray]]) -> MetricSamples:
+    """Put what several seeds gave together."""
+    return MetricSamples(np.stack([total for total, _ in parts]), np.stack([count for _, count in parts]))
 
 
-def _replicates(sums: Sums, num_bootstrap: int, seed_stream: int) -> Float[np.ndarray, " replicate"]:
-    num_seeds, num_trajectories = sums.total.shape[:2]
+def _replicates(samples: MetricSamples, num_bootstrap: int, seed_stream: int) -> Float[np.ndarray, " replicate"]:
+    num_seeds, num_trajectories = samples.total.shape[:2]
     if num_trajectories < 2:
         return np.full(num_bootstrap, np.nan)
     picks = np.random.default_rng(_TRAJECTORIES).integers(0, num_trajectories, size=(num_bootstrap, num_trajectories))
-    total, count = sums.total.sum(2), sums.count.sum(2)
+    total, count = samples.total.sum(2), samples.count.sum(2)
     means = np.stack([_ratio(total[seed][picks].sum(1), count[seed][picks].sum(1)) for seed in range(num_seeds)])
     seeds = np.random.default_rng(seed_stream).integers(0, num_seeds, size=(num_bootstrap, num_seeds))
     return means[seeds, np.arange(num_bootstrap)[:, None]].mean(1)

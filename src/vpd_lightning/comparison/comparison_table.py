@@ -1,12 +1,11 @@
-"""Runs brought together: one board per data set and protocol, one row per system and setting, seeds in the row."""
+"""Runs brought together: one table per data set and protocol, one row per system and setting, seeds in the row."""
 
 import hashlib
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from vpd_lightning.comparison.bootstrap import Estimate, Sums, estimate, stacked
-from vpd_lightning.comparison.measure import BY_NAME
+from vpd_lightning.comparison.bootstrap import Estimate, MetricSamples, estimate, stacked
 from vpd_lightning.comparison.run import Run
 from vpd_lightning.comparison.settings import (
     TRAJECTORIES,
@@ -16,6 +15,8 @@ from vpd_lightning.comparison.settings import (
     label,
     naming_keys,
 )
+from vpd_lightning.metrics.metric_info import MetricInfo
+from vpd_lightning.metrics.registry import compared, metric
 
 # The order of the paper's table; others follow by name.
 SYSTEMS = ("slotformer", "savi", "global", "sequential", "vpd", "inertial", "persistence")
@@ -29,7 +30,7 @@ Groups = dict[tuple[object, ...], list[Run]]
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """All seeds of one system in one setting; ``name`` tells it from the other rows of its board.
+    """All seeds of one system in one setting; ``name`` tells it from the other rows of its table.
 
     ``settings`` are those that differ among the rows of its system, ``is_main`` marks the one that stands for it.
     """
@@ -40,36 +41,36 @@ class Row:
     runs: tuple[Run, ...]
     is_main: bool
 
-    def sums(self, measure: str, source: str = "model") -> Sums | None:
-        """The sums of all seeds; None unless each of them has them."""
-        parts = [run.sums.get((source, measure)) for run in self.runs]
+    def samples(self, name: str, source: str = "model") -> MetricSamples | None:
+        """What all seeds measured by a metric; None unless each of them did."""
+        parts = [run.samples.get((source, name)) for run in self.runs]
         known = [part for part in parts if part is not None]
         if len(known) < len(parts) or len({part[0].shape for part in known}) != 1:
             return None
         return stacked(known)
 
-    def estimate(self, measure: str) -> Estimate | None:
-        """Mean over the seeds of the printed means, with the interval that the arrays give."""
-        return self._estimates[measure]
+    def estimate(self, name: str) -> Estimate | None:
+        """Mean over the seeds of a metric's printed means, with the interval that the arrays give."""
+        return self._estimates[name]
 
     @cached_property
     def _estimates(self) -> dict[str, Estimate | None]:
-        return {measure: self._estimate(measure) for measure in BY_NAME}
+        return {info.name: self._estimate(info) for info in compared()}
 
-    def _estimate(self, measure: str) -> Estimate | None:
-        summaries = [BY_NAME[measure].summary(run.metrics) for run in self.runs]
+    def _estimate(self, info: MetricInfo) -> Estimate | None:
+        summaries = [info.summary(run.metrics) for run in self.runs]
         means = [summary["mean"] for summary in summaries if summary is not None]
         if len(means) < len(self.runs):
             return None
-        sums = self.sums(measure)
-        found = estimate(sums, self.runs[0].num_bootstrap) if sums is not None else None
+        samples = self.samples(info.name)
+        found = estimate(samples, self.runs[0].num_bootstrap) if samples is not None else None
         printed = summaries[0]["ci95"] if len(means) == 1 and summaries[0] else None
         interval = found.interval if found else tuple(printed) if printed else None
         return Estimate(sum(means) / len(means), interval)
 
-    def per_step(self, measure: str) -> list[float | None]:
+    def per_step(self, name: str) -> list[float | None]:
         """Mean over the seeds of each step's printed mean; empty where there is none."""
-        summaries = [BY_NAME[measure].summary(run.metrics) for run in self.runs]
+        summaries = [metric(name).summary(run.metrics) for run in self.runs]
         curves = [summary.get("per_step") or [] for summary in summaries if summary is not None]
         if len(curves) < len(self.runs) or len({len(curve) for curve in curves}) != 1:
             return []
@@ -77,7 +78,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Board:
+class ComparisonTable:
     """The rows that may be compared: same experiment, same bytes of data, same protocol."""
 
     experiment: str
@@ -92,7 +93,7 @@ class Board:
 
     @property
     def runs(self) -> list[Run]:
-        """All runs of the board."""
+        """All runs of the table."""
         return [run for row in self.rows for run in row.runs]
 
     @property
@@ -100,24 +101,24 @@ class Board:
         """The title as files are named."""
         return "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in self.title)
 
-    def reference(self, source: str, measure: str) -> Estimate | None:
+    def reference(self, source: str, name: str) -> Estimate | None:
         """The score of ``copy_last`` or ``train_mean``, which is that of the first run that has it."""
-        found = (BY_NAME[measure].summary(run.metrics, source) for run in self.runs)
+        found = (metric(name).summary(run.metrics, source) for run in self.runs)
         summary = next((one for one in found if one is not None), None)
         if summary is None:
             return None
         interval = summary.get("ci95")
         return Estimate(summary["mean"], tuple(interval) if interval else None)
 
-    def reference_sums(self, source: str, measure: str) -> Sums | None:
-        """The sums of a reference, as those of one seed."""
-        found = (run.sums.get((source, measure)) for run in self.runs)
+    def reference_samples(self, source: str, name: str) -> MetricSamples | None:
+        """What was measured of a reference, as that of one seed."""
+        found = (run.samples.get((source, name)) for run in self.runs)
         part = next((one for one in found if one is not None), None)
         return None if part is None else stacked([part])
 
 
-def boards_of(runs: Sequence[Run]) -> list[Board]:
-    """Bring runs together. Runs on other data or under another protocol get a board of their own."""
+def comparison_tables(runs: Sequence[Run]) -> list[ComparisonTable]:
+    """Bring runs together. Runs on other data or under another protocol get a table of their own."""
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in sorted(runs, key=lambda run: (_rank(EXPERIMENTS, run.experiment), run.data_sha256, run.protocol)):
         groups.setdefault((run.experiment, run.data_sha256, run.protocol), []).append(run)
@@ -125,15 +126,15 @@ def boards_of(runs: Sequence[Run]) -> list[Board]:
     for run in runs:
         compared.setdefault(run.config.get("sweep_name"), set()).add((run.experiment, run.system))
     reach = {sweep: len(places) for sweep, places in compared.items()}
-    boards = []
+    tables = []
     for (experiment, data_sha256, protocol), group in groups.items():
         same_name = [key for key in groups if key[0] == experiment]
         other_data, other_protocol = (len({key[i] for key in same_name}) > 1 for i in (1, 2))
         title = experiment
         title += f"-data-{data_sha256[:6]}" if other_data else ""
         title += f"-protocol-{hashlib.sha256(protocol.encode()).hexdigest()[:6]}" if other_protocol else ""
-        boards.append(Board(experiment, title, data_sha256, tuple(_rows(group, reach))))
-    return boards
+        tables.append(ComparisonTable(experiment, title, data_sha256, tuple(_rows(group, reach))))
+    return tables
 
 
 def _rows(runs: Sequence[Run], reach: Mapping[object, int]) -> list[Row]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vpd_lightning.comparison.comparison_table import Board, Row
+from vpd_lightning.comparison.comparison_table import ComparisonTable, Row
 from vpd_lightning.comparison.kept_rollouts import KeptRollouts, Rollout, camera_title, clip_file_name, of_same_truth
 from vpd_lightning.media.video import enlarge, framed, label_bar, write_video
 
@@ -15,16 +15,16 @@ _DARK = 24
 _STEPS_PER_SECOND = 8.0  # slower than the motion itself, so that one sees where systems part
 
 
-def write_films(folder: Path, board: Board, kept: KeptRollouts) -> list[Path]:
-    """Write ``film_<board>_<clip>.webm`` for every clip that some system's main row kept.
+def write_films(folder: Path, table: ComparisonTable, kept: KeptRollouts) -> list[Path]:
+    """Write ``film_<table>_<clip>.webm`` for every clip that some system's main row kept.
 
     Raises:
         ConfigError: this OpenCV cannot write VP9.
     """
     written = []
     for clip, views in kept.clips.items():
-        path = folder / f"film_{board.file_name}_{clip_file_name(clip)}.webm"
-        rows = [_row(clip, view, rollouts, board.main_rows) for view, rollouts in sorted(views.items())]
+        path = folder / f"film_{table.file_name}_{clip_file_name(clip)}.webm"
+        rows = [_row(clip, view, rollouts, table.main_rows) for view, rollouts in sorted(views.items())]
         num_steps, width = (max(row.shape[axis] for row in rows) for axis in (0, 2))
         write_video(path, np.concatenate([_filled(row, num_steps, width) for row in rows], axis=1), _STEPS_PER_SECOND)
         written.append(path)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from vpd_lightning.comparison.comparison_table import Board, Row
+from vpd_lightning.comparison.comparison_table import ComparisonTable, Row
 
 _MAX_BYTES = 2**31
 
@@ -41,11 +41,11 @@ class KeptRollouts:
     skipped: list[tuple[Path, str]]
 
 
-def kept_rollouts(board: Board) -> KeptRollouts:
+def kept_rollouts(table: ComparisonTable) -> KeptRollouts:
     """Read what the main row of every system kept; of several seeds, the first."""
     clips: dict[str, dict[int, dict[str, Rollout]]] = {}
     skipped: list[tuple[Path, str]] = []
-    for row in board.main_rows:
+    for row in table.main_rows:
         path = row.runs[0].evaluation / "rollouts.npz"
         if not path.exists():
             skipped.append((path, "not there: an older version evaluated the run"))

@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vpd_lightning.comparison.comparison_table import Board
-from vpd_lightning.comparison.measure import BY_NAME
+from vpd_lightning.comparison.comparison_table import ComparisonTable
 from vpd_lightning.comparison.sweep import Sweep
 from vpd_lightning.comparison.tables import (
     differences_table,
@@ -15,9 +14,10 @@ from vpd_lightning.comparison.tables import (
     systems_table,
     winners,
 )
-from vpd_lightning.comparison.warnings import board_warnings, parted_experiments
+from vpd_lightning.comparison.warnings import parted_experiments, table_warnings
+from vpd_lightning.metrics.metric_info import MetricInfo
+from vpd_lightning.metrics.registry import HEADLINE, blocks, compared, metric, scores
 
-_OVERVIEWS = ("psnr", "ssim", "psnr_moving")
 _READING = """\
 ## How to read the tables
 
@@ -27,16 +27,15 @@ _READING = """\
 - **Bold**: the best system, whose interval no other one reaches. `~`: the best and those whose interval overlaps its
   interval ("within the interval"); none where training budgets differ. Paired differences, of the steps that both
   predict, can tell systems apart that intervals cannot.
-- Sharpness ratio: 1 is as sharp as the truth; where most of a picture does not move, the background dominates it.
-  Rigidity error and deepest particle are small also where nothing moves: read them beside the centroid error.
+{metrics}
 - Budget: what a training was allowed; minutes: what it took, by the named clock; both with its pretraining. Steps:
   updates behind the evaluated weights, without those of a pretraining.
 - `-`: not known, or the system has no such thing."""
 
 
 @dataclass(frozen=True)
-class BoardFiles:
-    """The pictures of one board, by what they show; ``not_shown`` names rollouts that are missing, and why."""
+class TableFiles:
+    """The pictures of one table, by what they show; ``not_shown`` names rollouts that are missing, and why."""
 
     rollout: Path | None
     settings: Mapping[str, Path]
@@ -48,39 +47,43 @@ class BoardFiles:
 
 def page(
     title: str,
-    boards: Sequence[Board],
-    files: Sequence[BoardFiles],
+    tables: Sequence[ComparisonTable],
+    files: Sequence[TableFiles],
     overview_picture: Path | None,
     left_out: Sequence[tuple[Path, str]],
 ) -> str:
     """Put the report together; pictures lie in the same folder."""
-    num_runs = sum(len(board.runs) for board in boards)
+    num_runs = sum(len(table.runs) for table in tables)
     lines = [
         f"# {title}",
         "",
         f"{num_runs} run{'s' * (num_runs > 1)}, {len(left_out)} left out (listed at the end).",
         "",
     ]
-    warnings = parted_experiments(boards)
-    warnings += [f"{board.title}: {words}" for board in boards for words in board_warnings(board)]
+    warnings = parted_experiments(tables)
+    warnings += [f"{table.title}: {words}" for table in tables for words in table_warnings(table)]
     if warnings:
         lines += ["## Warnings", "", *(f"- {words}" for words in warnings), ""]
-    lines += [_READING.format(bootstrap=max(board.runs[0].num_bootstrap for board in boards)), "", "## Overview", ""]
-    for name in _OVERVIEWS:
-        if any(row.estimate(name) for board in boards for row in board.main_rows):
-            lines += [*overview(boards, BY_NAME[name]), ""]
-    lines += [f"- {board.title}: {row.name} stands for {row.system}." for board in boards for row in board.main_rows
+    bootstrap = max(table.runs[0].num_bootstrap for table in tables)
+    meanings = "\n".join(f"- {info.label}: {info.description}." for info in compared())
+    lines += [_READING.format(bootstrap=bootstrap, metrics=meanings), "", "## Overview", ""]
+    for info in scores():
+        if any(row.estimate(info.name) for table in tables for row in table.main_rows):
+            lines += [*overview(tables, info), ""]
+    lines += [f"- {table.title}: {row.name} stands for {row.system}." for table in tables for row in table.main_rows
               if row.name != row.system]  # fmt: skip
-    lines += ["", _picture("PSNR over the rollout", overview_picture), ""] if overview_picture else [""]
-    for board, own in zip(boards, files, strict=True):
-        lines += _board(board, own)
-    lines += ["## Runs", "", *_runs(boards), "", "## Left out, and why", ""]
+    lines += (
+        ["", _picture(f"{metric(HEADLINE).title} over the rollout", overview_picture), ""] if overview_picture else [""]
+    )
+    for table, own in zip(tables, files, strict=True):
+        lines += _table(table, own)
+    lines += ["## Runs", "", *_runs(tables), "", "## Left out, and why", ""]
     lines += [f"- `{path}`: {why}" for path, why in left_out] or ["Nothing."]
     return "\n".join(_without_double_blanks(lines)) + "\n"
 
 
-def _board(board: Board, files: BoardFiles) -> list[str]:
-    protocol = board.runs[0].metrics["protocol"]
+def _table(table: ComparisonTable, files: TableFiles) -> list[str]:
+    protocol = table.runs[0].metrics["protocol"]
     facts = [
         f"{protocol[key]} {words}"
         for key, words in (
@@ -92,28 +95,27 @@ def _board(board: Board, files: BoardFiles) -> list[str]:
         if protocol.get(key) is not None
     ]
     starts = protocol.get("start_frames")
-    lines = [f"## {board.title}", "", f"{', '.join(facts)}; split {protocol.get('split')}, first frames {starts}; "
-             f"data `{board.data_sha256[:12]}`.", ""]  # fmt: skip
-    lines += [*(f"- **Warning:** {words}" for words in board_warnings(board)), "", *systems_table(board), ""]
-    lines += _machines(board)
-    followed = _true_depths(board)
-    if followed:
-        lines += [
-            f"Deepest particle (cm) where they follow the true motion, since cameras put them there: {followed}.",
-            "",
-        ]
+    lines = [f"## {table.title}", "", f"{', '.join(facts)}; split {protocol.get('split')}, first frames {starts}; "
+             f"data `{table.data_sha256[:12]}`.", ""]  # fmt: skip
+    lines += [*(f"- **Warning:** {words}" for words in table_warnings(table)), "", *systems_table(table), ""]
+    lines += _machines(table)
+    for info in blocks():
+        followed = _of_true_motion(table, info)
+        if followed:
+            words = f"What the true motion would give, since cameras put the particles there; {info.label}: {followed}."
+            lines += [words, ""]
     if files.rollout:
         lines += [_picture("scores over the rollout", files.rollout), ""]
-    best = winners(board)
+    best = winners(table)
     if best:
         lines += ["### Who is best", "", *best, ""]
-    paired = differences_table(board)
+    paired = differences_table(table)
     if paired:
         words = "Mean differences on the same trajectories, with their intervals; one that holds 0 tells nothing apart."
         lines += ["### Paired differences", "", words, "", *paired, ""]
-    settings = settings_table(board)
+    settings = settings_table(table)
     if settings:
-        lines += ["### Settings", "", *settings, "", "All that differs:", "", *settings_lists(board), ""]
+        lines += ["### Settings", "", *settings, "", "All that differs:", "", *settings_lists(table), ""]
     for sweep, path in files.sweeps:
         lines += [_picture(f"scores over {sweep.title}", path), ""]
         lines += [f"Not drawn: {row.name}, whose data set is not there to count." for row in sweep.not_placed]
@@ -131,27 +133,27 @@ def _board(board: Board, files: BoardFiles) -> list[str]:
     return [*lines, ""]
 
 
-def _machines(board: Board) -> list[str]:
-    known = list(dict.fromkeys(run.machine for row in board.main_rows for run in row.runs if run.machine is not None))
-    budgets = list(dict.fromkeys(run.declared_budget for row in board.main_rows for run in row.runs))
+def _machines(table: ComparisonTable) -> list[str]:
+    known = list(dict.fromkeys(run.machine for row in table.main_rows for run in row.runs if run.machine is not None))
+    budgets = list(dict.fromkeys(run.declared_budget for row in table.main_rows for run in row.runs))
     return [f"Budget: {' and '.join(budgets)}; trained on {' and on '.join(known)}.", ""] if known else []
 
 
-def _true_depths(board: Board) -> str:
-    measure, found = BY_NAME["penetration"], []
-    for row in board.main_rows:
-        depths = [(run.metrics.get("penetration") or {}).get("true_motion") for run in row.runs]
-        known = [depth for depth in depths if depth is not None]
+def _of_true_motion(table: ComparisonTable, info: MetricInfo) -> str:
+    found = []
+    for row in table.main_rows:
+        means = [(run.metrics.get(info.name) or {}).get("true_motion") for run in row.runs]
+        known = [mean for mean in means if mean is not None]
         if known:
-            found.append(f"{row.name} {measure.shown(sum(known) / len(known))}")
+            found.append(f"{row.name} {info.shown(sum(known) / len(known))}")
     return ", ".join(found)
 
 
-def _runs(boards: Sequence[Board]) -> list[str]:
+def _runs(tables: Sequence[ComparisonTable]) -> list[str]:
     return [
-        f"- {board.title}, {row.name}, seed {run.seed}: `{run.evaluation}`"
-        for board in boards
-        for row in board.rows
+        f"- {table.title}, {row.name}, seed {run.seed}: `{run.evaluation}`"
+        for table in tables
+        for row in table.rows
         for run in row.runs
     ]
 

@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator, ScalarFormatter
 
 from vpd_lightning.comparison.bootstrap import step_band
-from vpd_lightning.comparison.comparison_table import Board, Row
-from vpd_lightning.comparison.measure import BY_NAME, REFERENCES, Measure
+from vpd_lightning.comparison.comparison_table import ComparisonTable, Row
 from vpd_lightning.comparison.sweep import Sweep
 from vpd_lightning.comparison.tables import TITLES
 from vpd_lightning.files import AtomicPath
+from vpd_lightning.metrics.metric_info import MetricInfo
+from vpd_lightning.metrics.registry import HEADLINE, REFERENCES, image_metrics, metric, scores
 
 _COLORS = {
     "vpd": "#0072b2", "slotformer": "#d55e00", "global": "#009e73", "sequential": "#cc79a7", "inertial": "#8c6d1f",
@@ -26,117 +27,117 @@ _REFERENCE_STYLES: dict[str, dict[str, Any]] = {
     "train_mean": {"color": "#999999", "linestyle": ":", "linewidth": 1.6},
 }
 _MARKERS = "os^Dv<>Pph*X"
-_CURVES = ("psnr", "psnr_moving", "ssim", "sharpness")
-_SWEPT = ("psnr", "psnr_moving", "ssim")
 _BAND_ALPHA = 0.15
 _MAX_BANDS = 8  # more hide each other
 
 
-def rollout_plot(path: Path, board: Board) -> bool:
+def rollout_plot(path: Path, table: ComparisonTable) -> bool:
     """Draw every system's scores over the predicted step, with 95 % bands; False: there is nothing to draw."""
-    rows = board.main_rows
-    measures = [BY_NAME[name] for name in _CURVES if any(row.per_step(name) for row in rows)]
-    return _curves(path, board, measures, [(row, row.system, _color(row.system, i)) for i, row in enumerate(rows)])
+    rows = table.main_rows
+    infos = [info for info in image_metrics() if any(row.per_step(info.name) for row in rows)]
+    return _curves(path, table, infos, [(row, row.system, _color(row.system, i)) for i, row in enumerate(rows)])
 
 
-def settings_plot(path: Path, board: Board, system: str) -> bool:
+def settings_plot(path: Path, table: ComparisonTable, system: str) -> bool:
     """Draw the scores of every setting of one system over the predicted step."""
-    rows = [row for row in board.rows if row.system == system]
+    rows = [row for row in table.rows if row.system == system]
     colors = [*_COLORS.values(), *_SPARE]
     named = [(row, row.name, colors[i % len(colors)]) for i, row in enumerate(rows)]
-    measures = [BY_NAME[name] for name in _CURVES if any(row.per_step(name) for row in rows)]
-    return _curves(path, board, measures, named)
+    infos = [info for info in image_metrics() if any(row.per_step(info.name) for row in rows)]
+    return _curves(path, table, infos, named)
 
 
-def overview_plot(path: Path, boards: Sequence[Board]) -> bool:
-    """Draw PSNR over the predicted step, one panel per data set (the paper's figure)."""
-    columns = min(len(boards), 4)
-    rows = -(-len(boards) // columns)
+def overview_plot(path: Path, tables: Sequence[ComparisonTable]) -> bool:
+    """Draw the headline metric over the predicted step, one panel per data set (the paper's figure)."""
+    columns = min(len(tables), 4)
+    rows = -(-len(tables) // columns)
     figure = Figure(figsize=(4.0 * columns + 1.6, 3.3 * rows), layout="constrained")
     panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for panel, board in zip(panels, boards, strict=False):
-        lines = [(row, row.system, _color(row.system, i)) for i, row in enumerate(board.main_rows)]
-        _curve_panel(panel, board, BY_NAME["psnr"], lines, has_bands=len(lines) <= _MAX_BANDS)
-        panel.set_title(board.title, fontsize=11)
-    for panel in panels[len(boards) :]:
+    for panel, table in zip(panels, tables, strict=False):
+        lines = [(row, row.system, _color(row.system, i)) for i, row in enumerate(table.main_rows)]
+        _curve_panel(panel, table, metric(HEADLINE), lines, has_bands=len(lines) <= _MAX_BANDS)
+        panel.set_title(table.title, fontsize=11)
+    for panel in panels[len(tables) :]:
         panel.set_axis_off()
     _legend(figure, panels)
     _save(figure, path)
     return True
 
 
-def sweep_plot(path: Path, board: Board, sweep: Sweep) -> bool:
+def sweep_plot(path: Path, table: ComparisonTable, sweep: Sweep) -> bool:
     """Draw scores over a swept setting: a line per system (and further settings), intervals as bars."""
-    measures = [BY_NAME[name] for name in _SWEPT if any(row.estimate(name) for row, _ in sweep.points)]
-    if not measures:
+    infos = [info for info in scores() if any(row.estimate(info.name) for row, _ in sweep.points)]
+    if not infos:
         return False
-    figure = Figure(figsize=(4.2 * len(measures) + 1.8, 3.5), layout="constrained")
-    panels = list(figure.subplots(1, len(measures), squeeze=False)[0])
-    for panel, measure in zip(panels, measures, strict=True):
+    figure = Figure(figsize=(4.2 * len(infos) + 1.8, 3.5), layout="constrained")
+    panels = list(figure.subplots(1, len(infos), squeeze=False)[0])
+    for panel, info in zip(panels, infos, strict=True):
         for number, (name, points) in enumerate(sweep.lines.items()):
-            _sweep_line(panel, measure, name, points, number, is_joined=sweep.is_joined)
+            _sweep_line(panel, info, name, points, number, is_joined=sweep.is_joined)
         for source in REFERENCES:
-            reference = board.reference(source, measure.name)
+            reference = table.reference(source, info.name)
             if reference is not None:
-                panel.axhline(measure.scale * reference.mean, label=TITLES[source], **_REFERENCE_STYLES[source])
+                panel.axhline(info.scale * reference.mean, label=TITLES[source], **_REFERENCE_STYLES[source])
         _sweep_axis(panel, sweep)
-        panel.set_ylabel(measure.title)
+        panel.set_ylabel(info.label)
         panel.grid(alpha=0.3)
-    figure.suptitle(board.title, fontsize=11)
+    figure.suptitle(table.title, fontsize=11)
     _legend(figure, panels)
     _save(figure, path)
     return True
 
 
-def _curves(path: Path, board: Board, measures: Sequence[Measure], lines: Sequence[tuple[Row, str, str]]) -> bool:
-    if not measures:
+def _curves(
+    path: Path, table: ComparisonTable, infos: Sequence[MetricInfo], lines: Sequence[tuple[Row, str, str]]
+) -> bool:
+    if not infos:
         return False
-    figure = Figure(figsize=(4.2 * len(measures) + 1.8, 3.5), layout="constrained")
-    panels = list(figure.subplots(1, len(measures), squeeze=False)[0])
-    for panel, measure in zip(panels, measures, strict=True):
-        _curve_panel(panel, board, measure, lines, has_bands=len(lines) <= _MAX_BANDS)
-    figure.suptitle(board.title, fontsize=11)
+    figure = Figure(figsize=(4.2 * len(infos) + 1.8, 3.5), layout="constrained")
+    panels = list(figure.subplots(1, len(infos), squeeze=False)[0])
+    for panel, info in zip(panels, infos, strict=True):
+        _curve_panel(panel, table, info, lines, has_bands=len(lines) <= _MAX_BANDS)
+    figure.suptitle(table.title, fontsize=11)
     _legend(figure, panels)
     _save(figure, path)
     return True
 
 
 def _curve_panel(
-    panel: Axes, board: Board, measure: Measure, lines: Sequence[tuple[Row, str, str]], has_bands: bool
+    panel: Axes, table: ComparisonTable, info: MetricInfo, lines: Sequence[tuple[Row, str, str]], has_bands: bool
 ) -> None:
     for row, name, color in lines:
-        curve = _numbers(row.per_step(measure.name))
+        curve = _numbers(row.per_step(info.name))
         steps = np.arange(1, len(curve) + 1)
         marker = "o" if len(curve) == 1 else None
-        panel.plot(steps, measure.scale * curve, color=color, linewidth=1.8, label=name, marker=marker)
-        sums = row.sums(measure.name)
-        if has_bands and sums is not None and sums.total.shape[2] == len(curve):
-            low, high = measure.scale * step_band(sums, row.runs[0].num_bootstrap)
+        panel.plot(steps, info.scale * curve, color=color, linewidth=1.8, label=name, marker=marker)
+        samples = row.samples(info.name)
+        if has_bands and samples is not None and samples.total.shape[2] == len(curve):
+            low, high = info.scale * step_band(samples, row.runs[0].num_bootstrap)
             panel.fill_between(steps, low, high, color=color, alpha=_BAND_ALPHA, linewidth=0)
     for source in REFERENCES:
-        summary = measure.summary(board.runs[0].metrics, source)
-        if summary is not None and measure.better != "one":
+        summary = info.summary(table.runs[0].metrics, source)
+        if summary is not None and info.better != "one":
             curve = _numbers(summary["per_step"])
             style = _REFERENCE_STYLES[source]
-            panel.plot(np.arange(1, len(curve) + 1), measure.scale * curve, label=TITLES[source], **style)
-    if measure.better == "one":
+            panel.plot(np.arange(1, len(curve) + 1), info.scale * curve, label=TITLES[source], **style)
+    if info.better == "one":
         panel.axhline(1.0, color="#333333", linewidth=0.8)
     panel.set_xlabel("predicted step")
-    panel.set_ylabel(measure.title)
+    panel.set_ylabel(info.label)
     panel.grid(alpha=0.3)
     panel.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _sweep_line(
-    panel: Axes, measure: Measure, name: str, points: Sequence[tuple[Row, float]], number: int, is_joined: bool
+    panel: Axes, info: MetricInfo, name: str, points: Sequence[tuple[Row, float]], number: int, is_joined: bool
 ) -> None:
-    known = [(x, found) for row, x in points if (found := row.estimate(measure.name)) is not None]
+    known = [(x, found) for row, x in points if (found := row.estimate(info.name)) is not None]
     if not known:
         return
-    places, means = [x for x, _ in known], [measure.scale * found.mean for _, found in known]
+    places, means = [x for x, _ in known], [info.scale * found.mean for _, found in known]
     ends = [found.interval or (found.mean, found.mean) for _, found in known]
-    below = [max(mean - measure.scale * low, 0.0) for mean, (low, _) in zip(means, ends, strict=True)]
-    above = [max(measure.scale * high - mean, 0.0) for mean, (_, high) in zip(means, ends, strict=True)]
+    below = [max(mean - info.scale * low, 0.0) for mean, (low, _) in zip(means, ends, strict=True)]
+    above = [max(info.scale * high - mean, 0.0) for mean, (_, high) in zip(means, ends, strict=True)]
     style: dict[str, Any] = {"color": _color(points[0][0].system, number) if "(" not in name else _spare(number)}
     style["linestyle"] = "-" if is_joined else "none"
     panel.errorbar(

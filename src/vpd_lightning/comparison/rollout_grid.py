@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vpd_lightning.comparison.comparison_table import Board, Row
+from vpd_lightning.comparison.comparison_table import ComparisonTable, Row
 from vpd_lightning.comparison.kept_rollouts import KeptRollouts, Rollout, camera_title, clip_file_name, of_same_truth
 from vpd_lightning.media.pictures import write_png
 from vpd_lightning.media.video import enlarge, framed, label_bar
@@ -18,12 +18,12 @@ _NUM_SHOWN = 2  # shown of the context; SlotFormer has six
 _DARK = 24
 
 
-def write_strips(folder: Path, board: Board, kept: KeptRollouts) -> list[Path]:
-    """Write ``strips_<board>_<clip>.png`` for every clip that some system's main row kept."""
+def write_strips(folder: Path, table: ComparisonTable, kept: KeptRollouts) -> list[Path]:
+    """Write ``strips_<table>_<clip>.png`` for every clip that some system's main row kept."""
     written = []
     for clip, views in kept.clips.items():
-        path = folder / f"strips_{board.file_name}_{clip_file_name(clip)}.png"
-        blocks = [_block(clip, view, rollouts, board.main_rows) for view, rollouts in sorted(views.items())]
+        path = folder / f"strips_{table.file_name}_{clip_file_name(clip)}.png"
+        blocks = [_block(clip, view, rollouts, table.main_rows) for view, rollouts in sorted(views.items())]
         width = max(block.shape[1] for block in blocks)
         padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=_DARK) for b in blocks]
         write_png(path, np.concatenate(padded))

@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 
 from vpd_lightning.comparison.bootstrap import sums_of
-from vpd_lightning.comparison.measure import MEASURES, REFERENCES
+from vpd_lightning.metrics.registry import HEADLINE, SOURCES, compared
 
 KNOWN_FORMATS = (1,)
 _MAX_BYTES = 64 * 2**20
@@ -32,8 +32,8 @@ class Run:
 
     ``config`` and ``time`` are those of the evaluated checkpoint where the evaluation says them (a run that was resumed
     with other settings keeps its first ones in its folder), and else those of the run folder.
-    ``sums[source, measure]`` holds totals and counts (``trajectory step``) of what ``arrays.npz`` has, ``source`` being
-    ``model`` or a reference; ``clips`` names the clips (empty where there are no arrays).
+    ``samples[source, metric]`` holds totals and counts (``trajectory step``) of what ``arrays.npz`` has, ``source``
+    being ``model`` or a reference; ``clips`` names the clips (empty where there are no arrays).
     """
 
     folder: Path
@@ -46,7 +46,7 @@ class Run:
     time: Mapping[str, Any] | None
     machine: str | None
     clips: tuple[str, ...]
-    sums: Mapping[tuple[str, str], tuple[NDArray, NDArray]]
+    samples: Mapping[tuple[str, str], tuple[NDArray, NDArray]]
 
     @cached_property
     def protocol(self) -> str:
@@ -138,7 +138,7 @@ def read_run(folder: Path, evaluation: Path) -> Run:
     metrics = _read_json(evaluation / "metrics.json")
     if metrics.get("format_version") not in KNOWN_FORMATS:
         raise UnusableRunError(f"its metrics.json has format {metrics.get('format_version')!r}, not {KNOWN_FORMATS[0]}")
-    for key in ("protocol", "psnr", "references", "data_sha256"):
+    for key in ("protocol", HEADLINE, "references", "data_sha256"):
         if not metrics.get(key):
             raise UnusableRunError(f"its metrics.json has no {key}; run vpd-eval again")
         if not isinstance(metrics[key], str if key == "data_sha256" else Mapping):
@@ -147,7 +147,7 @@ def read_run(folder: Path, evaluation: Path) -> Run:
     for key, value in names.items():
         if value is None:
             raise UnusableRunError(f"it does not say its {key} (an older version made it); run vpd-eval again")
-    clips, sums = _read_sums(evaluation / "arrays.npz", metrics)
+    clips, samples = _read_samples(evaluation / "arrays.npz", metrics)
     run = Run(
         folder=folder,
         evaluation=evaluation,
@@ -159,7 +159,7 @@ def read_run(folder: Path, evaluation: Path) -> Run:
         time=_time(folder, metrics),
         machine=_machine(folder / "environment.json"),
         clips=clips,
-        sums=sums,
+        samples=samples,
     )
     _check_contents(run)
     return run
@@ -180,8 +180,8 @@ def _machine(path: Path) -> str | None:
 
 def _check_contents(run: Run) -> None:
     """Look at everything that a report will use: TypeError, ValueError or KeyError where it is something else."""
-    for source in ("model", *REFERENCES):
-        for summary in (measure.summary(run.metrics, source) for measure in MEASURES):
+    for source in SOURCES:
+        for summary in (info.summary(run.metrics, source) for info in compared()):
             if summary is not None:
                 low, high = summary.get("ci95") or (0.0, 0.0)
                 numbers = [value for value in summary.get("per_step") or () if value is not None]
@@ -191,23 +191,23 @@ def _check_contents(run: Run) -> None:
     run.metrics["references"].get("")
 
 
-def _read_sums(path: Path, metrics: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[tuple[str, str], Any]]:
+def _read_samples(path: Path, metrics: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[tuple[str, str], Any]]:
     if not path.exists():
         return (), {}
-    sums: dict[tuple[str, str], Any] = {}
+    samples: dict[tuple[str, str], Any] = {}
     try:
         with np.load(path, allow_pickle=False) as arrays:
             trajectory, clips = arrays["trajectory"], tuple(str(name) for name in arrays["clip"])
-            for source in ("model", *REFERENCES):
-                for measure in MEASURES:
-                    summary = measure.summary(metrics, source)
-                    name = next((name for name in measure.array_names(source) if name in arrays), None)
+            for source in SOURCES:
+                for info in compared():
+                    summary = info.summary(metrics, source)
+                    name = next((name for name in info.array_names(source) if name in arrays), None)
                     if name is not None and summary is not None:
-                        sums[source, measure.name] = sums_of(arrays[name], trajectory)
-                        _check_mean(name, sums[source, measure.name], summary["mean"])
+                        samples[source, info.name] = sums_of(arrays[name], trajectory)
+                        _check_mean(name, samples[source, info.name], summary["mean"])
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
         raise UnusableRunError(f"its arrays.npz cannot be read ({type(error).__name__}); run vpd-eval again") from error
-    return clips, sums
+    return clips, samples
 
 
 def _check_mean(name: str, sums: tuple[NDArray, NDArray], printed: float) -> None:

@@ -5,18 +5,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vpd_lightning.comparison.comparison_table import Board, Row
-from vpd_lightning.comparison.measure import MEASURES, REFERENCES
+from vpd_lightning.comparison.comparison_table import ComparisonTable, Row
 from vpd_lightning.comparison.run import Run
 from vpd_lightning.comparison.settings import shown
 from vpd_lightning.files import AtomicPath
+from vpd_lightning.metrics.registry import SOURCES, compared
 
 _IMAGE_PARTS = ("input_views", "other_views", "pooled")
 
 
-def write_spreadsheet(path: Path, boards: Sequence[Board]) -> None:
+def write_spreadsheet(path: Path, tables: Sequence[ComparisonTable]) -> None:
     """Write every run. Distances are metres, as in ``metrics.json``; intervals are those of the run alone."""
-    rows = [_cells(board, row, run) for board in boards for row in board.rows for run in row.runs]
+    rows = [_cells(table, row, run) for table in tables for row in table.rows for run in row.runs]
     columns = list(dict.fromkeys(key for row in rows for key in row))
     with AtomicPath(path) as partial, partial.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, columns, restval="")
@@ -24,9 +24,9 @@ def write_spreadsheet(path: Path, boards: Sequence[Board]) -> None:
         writer.writerows(rows)
 
 
-def _cells(board: Board, row: Row, run: Run) -> dict[str, Any]:
+def _cells(table: ComparisonTable, row: Row, run: Run) -> dict[str, Any]:
     cells: dict[str, Any] = {
-        "table": board.title,
+        "table": table.title,
         "experiment": run.experiment,
         "system": run.system,
         "row": row.name,
@@ -44,16 +44,16 @@ def _cells(board: Board, row: Row, run: Run) -> dict[str, Any]:
         "data_sha256": run.data_sha256,
         "checkpoint_sha256": run.metrics.get("checkpoint_sha256"),
     }
-    for source in ("model", *REFERENCES):
+    for source in SOURCES:
         prefix = "" if source == "model" else f"{source}_"
-        for measure in MEASURES:
-            summary = measure.summary(run.metrics, source)
+        for info in compared():
+            summary = info.summary(run.metrics, source)
             if summary is None:
                 continue
             low, high = summary.get("ci95") or (None, None)
-            cells |= {f"{prefix}{measure.name}": summary["mean"]}
-            cells |= {f"{prefix}{measure.name}_low": low, f"{prefix}{measure.name}_high": high}
-            cells |= {f"{prefix}{measure.name}_{part}": summary[part] for part in _IMAGE_PARTS if part in summary}
+            cells |= {f"{prefix}{info.name}": summary["mean"]}
+            cells |= {f"{prefix}{info.name}_low": low, f"{prefix}{info.name}_high": high}
+            cells |= {f"{prefix}{info.name}_{part}": summary[part] for part in _IMAGE_PARTS if part in summary}
     native = run.metrics.get("native") or {}
     return cells | {f"native_{key}": _mean(value) for key, value in native.items()}
 

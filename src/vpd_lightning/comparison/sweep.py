@@ -3,7 +3,7 @@
 from collections.abc import Hashable
 from dataclasses import dataclass
 
-from vpd_lightning.comparison.comparison_table import Board, Row
+from vpd_lightning.comparison.comparison_table import ComparisonTable, Row
 from vpd_lightning.comparison.settings import (
     PARTICLES,
     TRAJECTORIES,
@@ -27,7 +27,7 @@ _EVENLY_SPACED = ("scene.location_noise",)  # with 0 among powers of ten
 
 @dataclass(frozen=True)
 class Sweep:
-    """One swept setting of a board: ``lines[name]`` are rows and their places on the axis, from left to right.
+    """One swept setting of a table: ``lines[name]`` are rows and their places on the axis, from left to right.
 
     A line is named like its system where all else is as in the system's main row.
 
@@ -55,21 +55,21 @@ class Sweep:
         return self.key.removesuffix("._target_").rpartition(".")[2]
 
 
-def sweeps_of(board: Board) -> list[Sweep]:
+def sweeps_of(table: ComparisonTable) -> list[Sweep]:
     """Find every setting that a system was trained with at two values or more, all else that names rows being equal."""
     keys = dict.fromkeys(
         key
-        for system in dict.fromkeys(row.system for row in board.rows)
-        for key in naming_keys([comparable_settings(row.runs[0]) for row in board.rows if row.system == system])
+        for system in dict.fromkeys(row.system for row in table.rows)
+        for key in naming_keys([comparable_settings(row.runs[0]) for row in table.rows if row.system == system])
     )
-    found = (_along(board, key) for key in keys)
+    found = (_along(table, key) for key in keys)
     return [sweep for sweep in found if sweep is not None]
 
 
-def _along(board: Board, key: str) -> Sweep | None:
+def _along(table: ComparisonTable, key: str) -> Sweep | None:
     lines: dict[str, list[tuple[Row, Hashable]]] = {}
-    for system in dict.fromkeys(row.system for row in board.rows):
-        rows = [row for row in board.rows if row.system == system]
+    for system in dict.fromkeys(row.system for row in table.rows):
+        rows = [row for row in table.rows if row.system == system]
         settings = [comparable_settings(row.runs[0]) for row in rows]
         others = [name for name in naming_keys(settings, first=[key]) if name != key]
         usual = next((label(own, others) for row, own in zip(rows, settings, strict=True) if row.is_main), "")

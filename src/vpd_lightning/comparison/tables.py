@@ -3,10 +3,8 @@
 from collections.abc import Iterable, Sequence
 
 from vpd_lightning.comparison.bootstrap import Estimate
-from vpd_lightning.comparison.comparison_table import Board, Row, system_order
-from vpd_lightning.comparison.measure import BY_NAME, MEASURES, REFERENCES, Measure
+from vpd_lightning.comparison.comparison_table import ComparisonTable, Row, system_order
 from vpd_lightning.comparison.paired_differences import (
-    PAIRED,
     Standing,
     differing_budgets,
     paired_differences,
@@ -15,6 +13,8 @@ from vpd_lightning.comparison.paired_differences import (
 )
 from vpd_lightning.comparison.run import Run
 from vpd_lightning.comparison.settings import shown
+from vpd_lightning.metrics.metric_info import MetricInfo
+from vpd_lightning.metrics.registry import REFERENCES, compared, paired
 
 TITLES = {"copy_last": "copy last input frame", "train_mean": "training mean"}
 _WITHIN = " ~"
@@ -26,99 +26,96 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     return [*lines, *("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)]
 
 
-def overview(boards: Sequence[Board], measure: Measure) -> list[str]:
+def overview(tables: Sequence[ComparisonTable], info: MetricInfo) -> list[str]:
     """Systems in rows, data sets in columns, like the paper's tables; references below."""
-    systems = sorted({row.system for board in boards for row in board.main_rows}, key=system_order)
-    standings = [standing(board.main_rows, measure) for board in boards]
+    systems = sorted({row.system for table in tables for row in table.main_rows}, key=system_order)
+    standings = [standing(table.main_rows, info) for table in tables]
     lines = []
     for system in systems:
         cells = []
-        for board, place in zip(boards, standings, strict=True):
-            row = next((row for row in board.main_rows if row.system == system), None)
-            cells.append(_cell(measure, row.estimate(measure.name), row, place) if row else "-")
+        for table, place in zip(tables, standings, strict=True):
+            row = next((row for row in table.main_rows if row.system == system), None)
+            cells.append(_cell(info, row.estimate(info.name), row, place) if row else "-")
         lines.append([system, *cells])
     for source in REFERENCES:
-        found = [board.reference(source, measure.name) for board in boards]
-        lines.append([f"*{TITLES[source]}*", *(_estimate(measure, one) for one in found)])
-    return markdown([measure.title, *(board.title for board in boards)], lines)
+        found = [table.reference(source, info.name) for table in tables]
+        lines.append([f"*{TITLES[source]}*", *(_estimate(info, one) for one in found)])
+    return markdown([info.label, *(table.title for table in tables)], lines)
 
 
-def systems_table(board: Board) -> list[str]:
+def systems_table(table: ComparisonTable) -> list[str]:
     """One row per system in its main setting, and the two references."""
-    measures = _present(board, board.main_rows)
-    places = {measure.name: standing(board.main_rows, measure) for measure in measures}
+    infos = _present(table, table.main_rows)
+    places = {info.name: standing(table.main_rows, info) for info in infos}
     lines = []
-    for row in board.main_rows:
-        cells = [_cell(measure, row.estimate(measure.name), row, places[measure.name]) for measure in measures]
+    for row in table.main_rows:
+        cells = [_cell(info, row.estimate(info.name), row, places[info.name]) for info in infos]
         lines.append([row.system, *cells, *_cost(row)])
     for source in REFERENCES:
-        cells = [_estimate(measure, board.reference(source, measure.name)) for measure in measures]
+        cells = [_estimate(info, table.reference(source, info.name)) for info in infos]
         lines.append([f"*{TITLES[source]}*", *cells, *["-"] * len(_COST)])
-    return markdown(["system", *(measure.title for measure in measures), *_COST], lines)
+    return markdown(["system", *(info.label for info in infos), *_COST], lines)
 
 
-def settings_table(board: Board) -> list[str]:
+def settings_table(table: ComparisonTable) -> list[str]:
     """Every setting of the systems that were trained in more than one; nothing is marked as best here."""
-    rows = [row for row in board.rows if sum(other.system == row.system for other in board.rows) > 1]
-    measures = _present(board, rows)
-    lines = [
-        [row.name, *(_estimate(measure, row.estimate(measure.name)) for measure in measures), *_cost(row)]
-        for row in rows
-    ]
-    return markdown(["system and setting", *(measure.title for measure in measures), *_COST], lines) if rows else []
+    rows = [row for row in table.rows if sum(other.system == row.system for other in table.rows) > 1]
+    infos = _present(table, rows)
+    lines = [[row.name, *(_estimate(info, row.estimate(info.name)) for info in infos), *_cost(row)] for row in rows]
+    return markdown(["system and setting", *(info.label for info in infos), *_COST], lines) if rows else []
 
 
-def settings_lists(board: Board) -> list[str]:
+def settings_lists(table: ComparisonTable) -> list[str]:
     """All settings in which the rows of one system differ, also those that follow from another."""
     lines = []
-    for row in board.rows:
-        if row.settings and any(other.system == row.system and other is not row for other in board.rows):
+    for row in table.rows:
+        if row.settings and any(other.system == row.system and other is not row for other in table.rows):
             lines.append(f"- {row.name}: " + ", ".join(f"`{shown(k, v)}`" for k, v in row.settings.items()))
     return lines
 
 
-def winners(board: Board) -> list[str]:
-    """One line per measure: who is best, and who cannot be told from it."""
-    if len(board.main_rows) > 1 and differing_budgets(board.main_rows):
+def winners(table: ComparisonTable) -> list[str]:
+    """One line per metric: who is best, and who cannot be told from it."""
+    if len(table.main_rows) > 1 and differing_budgets(table.main_rows):
         return ["No system is called best, here and in the tables: their training budgets differ."]
     lines = []
-    for measure in MEASURES:
-        place = standing(board.main_rows, measure)
+    for info in compared():
+        place = standing(table.main_rows, info)
         if place is None:
             continue
-        best = place.best.estimate(measure.name)
-        words = f"- {measure.title}: {place.best.system} ({measure.shown(best.mean if best else None)})"
+        best = place.best.estimate(info.name)
+        words = f"- {info.label}: {place.best.system} ({info.shown(best.mean if best else None)})"
         if not place.within:
             words += ", and no other system's interval reaches its own"
         elif len(place.within) + 1 == place.num_rows:
             words += "; all others are within the interval"
         else:
             words += f"; {_are([row.system for row in place.within])} within the interval"
-        behind = [row.system for row in told_apart(place, board.runs[0].num_bootstrap)]
+        behind = [row.system for row in told_apart(place, table.runs[0].num_bootstrap)]
         if behind:
             words += f", though on the same clips {_are(behind)} worse"
         lines.append(words + ".")
     return lines
 
 
-def differences_table(board: Board) -> list[str]:
+def differences_table(table: ComparisonTable) -> list[str]:
     """Mean differences of pairs on the same clips."""
     lines = []
-    for first, second, found in paired_differences(board):
+    for first, second, found in paired_differences(table):
         if not found:
             continue
-        cells = [_difference(BY_NAME[name], found[name][0]) if name in found else "-" for name in PAIRED]
+        cells = [_difference(info, found[info.name][0]) if info.name in found else "-" for info in paired()]
         counts = sorted({number for _, number in found.values()})
         second = f"*{TITLES[second]}*" if second in TITLES else second
         lines.append(
             [f"{first} - {second}", *cells, " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))]
         )
-    head = ["first - second", *(BY_NAME[name].title for name in PAIRED), "trajectories"]
+    head = ["first - second", *(info.label for info in paired()), "trajectories"]
     return markdown(head, lines) if lines else []
 
 
-def _present(board: Board, rows: Sequence[Row]) -> list[Measure]:
-    return [measure for measure in MEASURES if any(row.estimate(measure.name) is not None for row in rows)]
+def _present(table: ComparisonTable, rows: Sequence[Row]) -> list[MetricInfo]:
+    return [info for info in compared() if any(row.estimate(info.name) is not None for row in rows)]
 
 
 _COST = ("budget", "minutes", "clock", "steps", "parameters", "seeds")
@@ -148,9 +145,9 @@ def _count(run: Run) -> str:
     return "-" if run.num_parameters is None else f"{run.num_parameters:,}"
 
 
-def _cell(measure: Measure, found: Estimate | None, row: Row, place: Standing | None) -> str:
+def _cell(info: MetricInfo, found: Estimate | None, row: Row, place: Standing | None) -> str:
     """Bold: best, and alone; a tilde: the best or within its interval."""
-    text = _estimate(measure, found)
+    text = _estimate(info, found)
     if place is None or found is None:
         return text
     if row is place.best and not place.within:
@@ -159,17 +156,17 @@ def _cell(measure: Measure, found: Estimate | None, row: Row, place: Standing | 
     return text + (_WITHIN if row is place.best or row in place.within else "")
 
 
-def _estimate(measure: Measure, found: Estimate | None) -> str:
+def _estimate(info: MetricInfo, found: Estimate | None) -> str:
     if found is None:
         return "-"
     if found.interval is None:
-        return measure.shown(found.mean)
-    return f"{measure.shown(found.mean)} [{measure.shown(found.interval[0])}, {measure.shown(found.interval[1])}]"
+        return info.shown(found.mean)
+    return f"{info.shown(found.mean)} [{info.shown(found.interval[0])}, {info.shown(found.interval[1])}]"
 
 
-def _difference(measure: Measure, found: Estimate) -> str:
+def _difference(info: MetricInfo, found: Estimate) -> str:
     values = [found.mean, *(found.interval or ())]
-    mean, *ends = [f"{measure.scale * value:+.{measure.digits}f}" for value in values]
+    mean, *ends = [f"{info.scale * value:+.{info.digits}f}" for value in values]
     return f"{mean} [{', '.join(ends)}]" if ends else mean
 
 

@@ -2,46 +2,46 @@
 
 from collections.abc import Mapping, Sequence
 
-from vpd_lightning.comparison.comparison_table import Board, Row
-from vpd_lightning.comparison.measure import REFERENCES
+from vpd_lightning.comparison.comparison_table import ComparisonTable, Row
 from vpd_lightning.comparison.paired_differences import differing_budgets
 from vpd_lightning.comparison.settings import PACE, comparable_settings, shown
+from vpd_lightning.metrics.registry import HEADLINE, REFERENCES, metric
 
 _TIME_TOLERANCE = 0.2
 _USED = 0.95  # of the budget; a training that ended by itself before has less behind it
 _SAME_REFERENCE = 1e-6
 
 
-def parted_experiments(boards: Sequence[Board]) -> list[str]:
+def parted_experiments(tables: Sequence[ComparisonTable]) -> list[str]:
     """Say where data sets or protocols part the runs of one experiment."""
     found = []
-    for experiment in dict.fromkeys(board.experiment for board in boards):
-        same = [board for board in boards if board.experiment == experiment]
+    for experiment in dict.fromkeys(table.experiment for table in tables):
+        same = [table for table in tables if table.experiment == experiment]
         if len(same) > 1:
-            digests = {board.data_sha256 for board in same}
+            digests = {table.data_sha256 for table in same}
             what = "with different protocols" if len(digests) == 1 else "on different data"
             found.append(
                 f"{experiment}: its runs were evaluated {what}, so they stand in {len(same)} tables "
-                f"({', '.join(board.title for board in same)}) and must not be compared across them."
+                f"({', '.join(table.title for table in same)}) and must not be compared across them."
             )
     return found
 
 
-def board_warnings(board: Board) -> list[str]:
-    """Say what the rows of a board do not share, and what is missing."""
-    rows = board.main_rows
+def table_warnings(table: ComparisonTable) -> list[str]:
+    """Say what the rows of a table do not share, and what is missing."""
+    rows = table.main_rows
     found = []
     if differing_budgets(rows):
         budgets = _by_row(rows, lambda row: sorted({run.declared_budget for run in row.runs}))
         found.append(f"the training budgets of the systems differ: {budgets}.")
     else:
         found += _measured_times(rows)
-    for system in dict.fromkeys(row.system for row in board.rows):
-        own = [row for row in board.rows if row.system == system]
+    for system in dict.fromkeys(row.system for row in table.rows):
+        own = [row for row in table.rows if row.system == system]
         if differing_budgets(own):
             budgets = ", ".join(sorted({run.declared_budget for row in own for run in row.runs}))
             found.append(f"the settings of {system} were trained with different budgets: {budgets}.")
-    found += [*_budget_use(board), *_differing_pace(board)]
+    found += [*_budget_use(table), *_differing_pace(table)]
     checkpoints = {run.checkpoint_name for row in rows for run in row.runs if run.checkpoint_name is not None}
     if len(checkpoints) > 1:
         names = _by_row(rows, lambda row: sorted({str(run.checkpoint_name) for run in row.runs}))
@@ -54,31 +54,31 @@ def board_warnings(board: Board) -> list[str]:
     )
     if len({tuple(run.metrics["protocol"].get("input_views") or ()) for row in rows for run in row.runs}) > 1:
         found.append(f"the systems do not look through the same cameras; input views: {views}.")
-    found += [*_other_data(board), *_trained_on(board)]
-    broken = [str(run.folder) for run in board.runs if run.metrics.get("finite") is False]
+    found += [*_other_data(table), *_trained_on(table)]
+    broken = [str(run.folder) for run in table.runs if run.metrics.get("finite") is False]
     if broken:
         found.append(
             "some predictions are not finite; as images they count as black, while errors of particles and bodies "
             f"leave them out, and paired differences leave them out for both: {', '.join(broken)}."
         )
-    bare = [str(run.folder) for run in board.runs if not run.sums]
+    bare = [str(run.folder) for run in table.runs if not run.samples]
     if bare:
         found.append(f"no arrays.npz, hence no paired differences and no interval over seeds: {', '.join(bare)}.")
-    if not _same_references(board):
+    if not _same_references(table):
         found.append("the scores of the references differ between its runs, though data and protocol are the same.")
     return found
 
 
-def _other_data(board: Board) -> list[str]:
+def _other_data(table: ComparisonTable) -> list[str]:
     """Say which runs are known to have been trained on another data set than the one they were evaluated on."""
-    trained = [(run, (run.metrics.get("training") or {}).get("data_sha256")) for run in board.runs]
-    other = [str(run.folder) for run, digest in trained if digest not in (None, board.data_sha256)]
+    trained = [(run, (run.metrics.get("training") or {}).get("data_sha256")) for run in table.runs]
+    other = [str(run.folder) for run, digest in trained if digest not in (None, table.data_sha256)]
     return [f"these were trained on another data set than they are evaluated on: {', '.join(other)}."] if other else []
 
 
-def _trained_on(board: Board) -> list[str]:
+def _trained_on(table: ComparisonTable) -> list[str]:
     """Say which runs were evaluated on what they were trained on, and of which that is not known."""
-    seen = [(str(run.folder), (run.metrics.get("seen_in_training") or {}).get("trajectories")) for run in board.runs]
+    seen = [(str(run.folder), (run.metrics.get("seen_in_training") or {}).get("trajectories")) for run in table.runs]
     some = [f"{folder} ({count} trajectories)" for folder, count in seen if count]
     unknown = [folder for folder, count in seen if count is None]
     found = [f"these were trained on what they are evaluated on: {', '.join(some)}."] if some else []
@@ -106,9 +106,9 @@ def _measured_times(rows: Sequence[Row]) -> list[str]:
     return []
 
 
-def _budget_use(board: Board) -> list[str]:
+def _budget_use(table: ComparisonTable) -> list[str]:
     """Say which runs with a time limit do not say what they took, or ended long before."""
-    limited = [(run, run.minutes_allowed) for run in board.runs if run.minutes_allowed is not None]
+    limited = [(run, run.minutes_allowed) for run in table.runs if run.minutes_allowed is not None]
     silent = [str(run.folder) for run, _ in limited if run.minutes is None]
     short = [
         f"{run.folder} ({run.minutes:.1f} of {allowed:g} min)"
@@ -119,9 +119,9 @@ def _budget_use(board: Board) -> list[str]:
     return [*found, f"these ended before their time budget: {', '.join(short)}."] if short else found
 
 
-def _differing_pace(board: Board) -> list[str]:
+def _differing_pace(table: ComparisonTable) -> list[str]:
     """With a time limit, what computes faster learns more: threads, workers, caches, devices, machines."""
-    limited = [row for row in board.main_rows if any(run.minutes_allowed is not None for run in row.runs)]
+    limited = [row for row in table.main_rows if any(run.minutes_allowed is not None for run in row.runs)]
     found = []
     for key in PACE:
         values = {row.system: [comparable_settings(run).get(key) for run in row.runs] for row in limited}
@@ -138,10 +138,10 @@ def _differing_pace(board: Board) -> list[str]:
     return found
 
 
-def _same_references(board: Board) -> bool:
+def _same_references(table: ComparisonTable) -> bool:
     for source in REFERENCES:
-        means = [run.metrics["references"].get(source, {}).get("psnr", {}).get("mean") for run in board.runs]
-        known = [mean for mean in means if mean is not None]
+        summaries = [metric(HEADLINE).summary(run.metrics, source) for run in table.runs]
+        known = [summary["mean"] for summary in summaries if summary is not None]
         if known and max(known) - min(known) > _SAME_REFERENCE:
             return False
     return True

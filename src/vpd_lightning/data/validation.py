@@ -16,11 +16,15 @@ _LONGEST_HISTORY = 6  # frames; of SlotFormer, the system that is shown most
 
 @dataclass(frozen=True)
 class VideoClip:
-    """Context frames (two, or as many as the system needs) and the frames after them (axes ``time view``)."""
+    """Context frames (two, or as many as the system needs) and the frames after them (axes ``time view``).
+
+    ``number`` is its place among all validation clips, whichever process predicts it.
+    """
 
     context: RGBDFrames
     target: RGBDFrames
     name: str
+    number: int
 
     def to(self, *args: Any, **kwargs: Any) -> "VideoClip":
         """Move both parts to a device or floating dtype."""
@@ -72,6 +76,7 @@ class ValidationClips(Dataset[VideoClip]):
             context=_frames(trajectory, range(start, first_target), self.input_views),
             target=_frames(trajectory, range(first_target, first_target + self.num_steps), self.target_views),
             name=f"{trajectory.path.parent.name}/{trajectory.path.name}@{start}",
+            number=index,
         )
 
 

@@ -91,11 +91,3 @@ def _near_surface(
     distance = np.full(len(points), np.inf)
     distance[inside] = near.distance
     return distance, near
-
-
-def surface_errors(
-    pred: Float[Tensor, "step particle 3"], surface: Float[Tensor, "step triangle 3 3"]
-) -> Float[Tensor, " step"]:
-    """Mean distance in metres from each step's points to the true surface of that step."""
-    pairs = zip(pred.numpy(), surface.numpy(), strict=True)
-    return torch.tensor([nearest_on_surface(points, corners).distance.mean() for points, corners in pairs])

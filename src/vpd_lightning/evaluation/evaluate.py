@@ -14,7 +14,7 @@ from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.errors import DataError
 from vpd_lightning.evaluation.kept_mean import kept_training_mean
 from vpd_lightning.evaluation.long_rollout import LongRollout, judge_long_rollout
-from vpd_lightning.evaluation.measuring import SYSTEMS, ClipResult, measure_clip
+from vpd_lightning.evaluation.measuring import Arrays, ClipMetrics
 from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
 from vpd_lightning.evaluation.prediction import (
     Prediction,
@@ -29,6 +29,7 @@ from vpd_lightning.evaluation.prediction import (
 )
 from vpd_lightning.evaluation.protocol import Protocol, read_clips
 from vpd_lightning.evaluation.references import median_displacements
+from vpd_lightning.metrics.registry import SOURCES
 
 Progress = Callable[[str, int, int], None]
 
@@ -38,10 +39,11 @@ class Evaluation:
     """Everything measured; the first axis of every array counts clips, ``trajectory`` says whose clip each one is.
 
     ``images[system][metric]`` and ``native[metric]`` (at the system's own ``resolution``) are [clip, view, step],
-    ``reconstruction[metric]`` [clip, view, 1], ``chamfer[part]`` [clip, step], ``motion[metric]`` and
-    ``penetration[part]`` [clip, object, step]. They are empty for what the system or the recordings do not have: a
-    resolution of its own (None), particles, ground truth. ``kept`` are the first clips with their predictions, for
-    pictures and videos, ``shown_views`` the cameras to show: one that particles are seen through, and one that not.
+    ``reconstruction[metric]`` [clip, view, 1], ``motion[metric]`` [clip, object, step], and ``blocks[metric][part]``
+    [clip, step] where all particles are judged together, [clip, object, step] where bodies are. They are empty for what
+    the system or the recordings do not have: a resolution of its own (None), particles, ground truth. ``kept`` are the
+    first clips with their predictions, for pictures and videos, ``shown_views`` the cameras to show: one that particles
+    are seen through, and one that not.
     """
 
     clips: list[str]
@@ -49,12 +51,11 @@ class Evaluation:
     input_views: list[int]
     shown_views: list[int]
     resolution: int | None
-    images: dict[str, dict[str, NDArray[np.float64]]]
-    reconstruction: dict[str, NDArray[np.float64]]
-    native: dict[str, NDArray[np.float64]]
-    chamfer: dict[str, NDArray[np.float64]]
-    motion: dict[str, NDArray[np.float64]]
-    penetration: dict[str, NDArray[np.float64]]
+    images: dict[str, Arrays]
+    reconstruction: Arrays
+    native: Arrays
+    motion: Arrays
+    blocks: dict[str, Arrays]
     long_rollouts: list[LongRollout]
     seconds: dict[str, float]
     finite: bool
@@ -62,15 +63,14 @@ class Evaluation:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays under flat names, for an NPZ file."""
-        groups: dict[str, dict[str, NDArray[np.float64]]] = {
+        groups: dict[str, Arrays] = {
             **self.images,
             "reconstruction": self.reconstruction,
             "native": self.native,
-            "chamfer": self.chamfer,
             "motion": self.motion,
-            "penetration": self.penetration,
+            **self.blocks,
         }
-        flat = {f"{group}/{name}": values for group, metrics in groups.items() for name, values in metrics.items()}
+        flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
         return {"trajectory": self.trajectory, "clip": np.array(self.clips), **flat}
 
 
@@ -104,7 +104,8 @@ def evaluate(
     constants = median_displacements(train_paths, protocol.start_frames, protocol.num_steps)
     watch = {"references": time.perf_counter() - began, "read": 0.0, "measure": 0.0}
     num_clips = len(paths) * len(protocol.start_frames)
-    names, trajectory, results, kept, timings, finite = [], [], [], [], [], True
+    names, trajectory, kept, timings, finite = [], [], [], [], True
+    metrics, resolution = ClipMetrics(), None
     tick = time.perf_counter()
     for number, clip in enumerate(read_clips(paths, protocol, num_context_frames(system))):
         watch["read"] += time.perf_counter() - tick
@@ -113,7 +114,7 @@ def evaluate(
             raise DataError(f"{clip.name} has images {tuple(clip.rgb.shape[1:])}, training {tuple(mean_image.shape)}.")
         prediction = predict_clip(system, without_depth(clip) if hide_depth else clip, input_views)
         tick = time.perf_counter()
-        results.append(measure_clip(clip, prediction, protocol, mean_image, constants.get(clip.start)))
+        metrics.update(number, clip, prediction, protocol, mean_image, constants.get(clip.start))
         names.append(clip.name)
         trajectory.append(clip.trajectory)
         timings.append(prediction.seconds)
@@ -133,8 +134,11 @@ def evaluate(
         input_views=views_seen(system, input_views, num_views),
         shown_views=_shown_views(list(input_views), num_views),
         resolution=resolution,
-        images={name: _stack([result.images[name] for result in results]) for name in SYSTEMS},
-        **_stack_all(results),
+        images={source: metrics.image_arrays(source, num_clips) for source in SOURCES},
+        reconstruction=metrics.reconstruction_arrays(num_clips),
+        native=metrics.native_arrays(num_clips),
+        motion=metrics.motion_arrays(num_clips),
+        blocks=metrics.block_arrays(num_clips),
         long_rollouts=long_rollouts,
         seconds={
             **{f"{name}_per_clip": float(np.mean([t[name] for t in timings])) for name in timings[0]},
@@ -151,17 +155,6 @@ def _shown_views(input_views: list[int], num_views: int) -> list[int]:
     known = [view for view in input_views if view < num_views]
     others = [view for view in range(num_views) if view not in known]
     return [*known[:1], *(others or known[1:])[:1]]
-
-
-def _stack_all(results: list[ClipResult]) -> dict[str, dict[str, NDArray[np.float64]]]:
-    groups = ("reconstruction", "native", "chamfer", "motion", "penetration")
-    return {group: _stack([getattr(result, group) for result in results]) for group in groups}
-
-
-def _stack(rows: list[dict[str, NDArray[np.float64]]]) -> dict[str, NDArray[np.float64]]:
-    """Stack the metrics that every clip has (ground truth may be missing from some recordings)."""
-    names = [name for name in rows[0] if all(name in row and row[name].shape == rows[0][name].shape for row in rows)]
-    return {name: np.stack([row[name] for row in rows]) for name in names}
 
 
 def _roll_out_long(

@@ -1,6 +1,6 @@
-"""Measure one predicted clip."""
+"""Measure predicted clips by every metric of the list."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,98 +10,134 @@ from torch import Tensor
 
 from vpd_lightning.data.clip import Clip
 from vpd_lightning.evaluation.bodies import find_bodies
-from vpd_lightning.evaluation.images import TrueImages, as_float, image_metrics, moving_pixels
-from vpd_lightning.evaluation.motion import MIN_BODY_PARTICLES, bodies_motion, chamfer_to_depth
-from vpd_lightning.evaluation.penetration import clip_penetration
+from vpd_lightning.evaluation.images import as_float, moving_pixels
+from vpd_lightning.evaluation.motion import body_tracks, true_points
 from vpd_lightning.evaluation.prediction import Prediction
 from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.geometry.resizing import resize_images
+from vpd_lightning.metrics.metric_info import MetricInfo
+from vpd_lightning.metrics.registry import (
+    REFERENCES,
+    SOURCES,
+    body_metrics,
+    image_metrics,
+    particle_metrics,
+    still_scores,
+)
+from vpd_lightning.metrics.sample_metric import SampleMetric
+from vpd_lightning.metrics.true_images import TrueImages
 
-SYSTEMS = ("model", "copy_last", "train_mean")
 Arrays = dict[str, NDArray[np.float64]]
 
 
-@dataclass(frozen=True)
-class ClipResult:
-    """What was measured: ``images[system][metric]`` (view, step), ``reconstruction[metric]`` (view, 1).
+class ClipMetrics:
+    """The metrics of an evaluation, filled clip by clip.
 
-    ``native[metric]`` (view, step) judges the model at its own resolution, ``chamfer[part]`` has the axis step, and
-    ``motion[metric]`` and ``penetration[part]`` have axes (object, step). They are empty for what a system does not
-    have (a resolution of its own, particles) and where there is no ground truth.
+    ``images[source]`` judge the model and both references in its place, ``reconstruction`` the decoded last input
+    frame, ``native`` the model at its own resolution, ``particles`` and ``bodies`` where it has particles (and where
+    there is ground truth). What a system does not have is never measured.
     """
 
-    images: dict[str, Arrays]
-    reconstruction: Arrays
-    native: Arrays
-    chamfer: Arrays
-    motion: Arrays
-    penetration: Arrays
+    def __init__(self) -> None:
+        self.images = {source: _sample_metrics(image_metrics()) for source in SOURCES}
+        self.reconstruction = _sample_metrics(still_scores())
+        self.native = _sample_metrics(image_metrics())
+        self.particles = _sample_metrics(particle_metrics())
+        self.bodies = _sample_metrics(body_metrics())
+
+    def update(
+        self,
+        number: int,
+        clip: Clip,
+        prediction: Prediction,
+        protocol: Protocol,
+        mean_image: Float[Tensor, "view height width 3"],
+        constants: Float[Tensor, "step object 3"] | None,
+    ) -> None:
+        """Compare a prediction, and both references in its place, with the truth of clip ``number``."""
+        moving = moving_pixels(clip, protocol)
+        truth = TrueImages(as_float(clip.target_rgb), moving, protocol.min_moving_pixels)
+        last_input = as_float(clip.rgb[-1:])
+        # Both references are one image per view: what does not depend on the step is computed once.
+        stand_ins = dict(zip(REFERENCES, (last_input, mean_image[None]), strict=True))
+        for source, pred in {"model": prediction.images, **stand_ins}.items():
+            _update(self.images[source], number, pred.nan_to_num(0.0), truth)
+        decoded = prediction.reconstruction.nan_to_num(0.0)[None]
+        _update(self.reconstruction, number, decoded, TrueImages(last_input))
+        if prediction.native is not None and prediction.native.shape == prediction.images.shape:
+            self.native = self.images["model"]
+        elif prediction.native is not None:
+            _update(self.native, number, *_native(prediction.native, clip, moving, protocol))
+        if prediction.positions is None:
+            return
+        positions = prediction.positions
+        points = [true_points(clip, step, protocol.num_chamfer_points) for step in range(positions.shape[0] - 1)]
+        _update(self.particles, number, positions[1:], points)
+        if clip.state is not None:
+            bodies = find_bodies(clip, positions[0], protocol.body_margin, positions.shape[0] - 1)
+            _update(self.bodies, number, body_tracks(clip, bodies, positions, constants))
+
+    def image_arrays(self, source: str, num_clips: int) -> Arrays:
+        """Every part of the metrics of images, axes ``clip view step``."""
+        return _image_arrays(self.images[source], num_clips)
+
+    def native_arrays(self, num_clips: int) -> Arrays:
+        """The same at the model's own resolution; empty where it has none."""
+        return _image_arrays(self.native, num_clips)
+
+    def reconstruction_arrays(self, num_clips: int) -> Arrays:
+        """Scores of the decoded last input frame, axes ``clip view 1``."""
+        arrays = _image_arrays(self.reconstruction, num_clips)
+        return {name: arrays[name] for name in self.reconstruction}
+
+    def motion_arrays(self, num_clips: int) -> Arrays:
+        """What is measured of bodies, axes ``clip object step``."""
+        return {
+            name: arrays[metric.info.part_names[0]]
+            for name, metric in self.bodies.items()
+            if not metric.info.has_block and (arrays := stacked(metric, num_clips))
+        }
+
+    def block_arrays(self, num_clips: int) -> dict[str, Arrays]:
+        """The metrics that stand by themselves, by part; axes ``clip step`` or ``clip object step``."""
+        metrics = {**self.particles, **self.bodies}
+        return {name: stacked(metric, num_clips) for name, metric in metrics.items() if metric.info.has_block}
 
 
-def measure_clip(
-    clip: Clip,
-    prediction: Prediction,
-    protocol: Protocol,
-    mean_image: Float[Tensor, "view height width 3"],
-    constants: Float[Tensor, "step object 3"] | None,
-) -> ClipResult:
-    """Compare a prediction, and both references in its place, with the truth."""
-    colors = as_float(clip.target_rgb)
-    moving = moving_pixels(clip, protocol)
-    target = TrueImages.of(colors, moving, protocol.min_moving_pixels)
-    last_input = as_float(clip.rgb[-1:])
-    # Both references are one image per view: what does not depend on the step is computed once.
-    systems = {"model": prediction.images, "copy_last": last_input, "train_mean": mean_image[None]}
-    images = {name: _numpy(image_metrics(pred.nan_to_num(0.0), target)) for name, pred in systems.items()}
-    everywhere = torch.ones_like(last_input[..., 0], dtype=torch.bool)
-    seen = TrueImages.of(last_input, everywhere, protocol.min_moving_pixels)
-    reconstruction = _numpy(image_metrics(prediction.reconstruction.nan_to_num(0.0)[None], seen))
-    return ClipResult(
-        images=images,
-        reconstruction={name: reconstruction[name] for name in ("psnr", "ssim")},
-        native=_native(prediction, clip, moving, protocol, images["model"]),
-        chamfer=_chamfer(clip, prediction, protocol),
-        **_bodies(clip, prediction, protocol, constants),
-    )
+def stacked(metric: SampleMetric, num_clips: int) -> Arrays:
+    """Stack the values of all clips by part; empty unless every clip has them, in one shape.
 
-
-def _native(prediction: Prediction, clip: Clip, moving: Tensor, protocol: Protocol, enlarged: Arrays) -> Arrays:
-    """Judge a model at its own resolution, against the truth made as small; a pixel moves by majority."""
-    if prediction.native is None:
+    Ground truth may be missing from some recordings, and their numbers of bodies may differ.
+    """
+    clips = list(metric.by_sample().values())
+    shapes = {part.shape for parts in clips for part in parts.values()}
+    if len(clips) < num_clips or len(shapes) != 1:
         return {}
-    if prediction.native.shape == prediction.images.shape:
-        return enlarged
-    resolution = prediction.native.shape[-3]
+    names = metric.info.part_names
+    return {name: np.stack([parts[name].double().cpu().numpy() for parts in clips]) for name in names}
+
+
+def _sample_metrics(infos: Sequence[MetricInfo]) -> dict[str, SampleMetric]:
+    return {info.name: SampleMetric(info) for info in infos}
+
+
+def _update(metrics: dict[str, SampleMetric], number: int, *inputs: object) -> None:
+    for metric in metrics.values():
+        metric.update(number, *inputs)
+
+
+def _image_arrays(metrics: dict[str, SampleMetric], num_clips: int) -> Arrays:
+    parts = [stacked(metric, num_clips) for metric in metrics.values()]
+    return {name: np.ascontiguousarray(values.swapaxes(1, 2)) for part in parts for name, values in part.items()}
+
+
+def _native(
+    native: Float[Tensor, "step view resolution resolution 3"], clip: Clip, moving: Tensor, protocol: Protocol
+) -> tuple[Tensor, TrueImages]:
+    """Bring the truth to the model's own resolution; a pixel moves by majority."""
+    resolution = native.shape[-3]
     colors = resize_images(as_float(clip.target_rgb), resolution)
     share = resize_images(moving[..., None].expand(*moving.shape, 3).float(), resolution)[..., 0]
     scale = (resolution / moving.shape[-2]) * (resolution / moving.shape[-1])
     min_pixels = max(1, round(protocol.min_moving_pixels * scale))
-    return _numpy(image_metrics(prediction.native.nan_to_num(0.0), TrueImages.of(colors, share >= 0.5, min_pixels)))
-
-
-def _chamfer(clip: Clip, prediction: Prediction, protocol: Protocol) -> Arrays:
-    if prediction.positions is None:
-        return {}
-    distances = [
-        chamfer_to_depth(clip, step, positions, protocol.num_chamfer_points)
-        for step, positions in enumerate(prediction.positions[1:])
-    ]
-    parts = ("mean", "accuracy", "completeness")
-    return {part: np.array([getattr(distance, part) for distance in distances]) for part in parts}
-
-
-def _bodies(
-    clip: Clip, prediction: Prediction, protocol: Protocol, constants: Float[Tensor, "step object 3"] | None
-) -> dict[str, Arrays]:
-    positions = prediction.positions
-    if clip.state is None or positions is None:
-        return {"motion": {}, "penetration": {}}
-    bodies = find_bodies(clip, positions[0], protocol.body_margin, positions.shape[0] - 1)
-    return {
-        "motion": _numpy(bodies_motion(bodies, positions, constants, clip.frame_time)),
-        "penetration": _numpy(clip_penetration(clip, bodies, positions, MIN_BODY_PARTICLES)),
-    }
-
-
-def _numpy(values: dict[str, Tensor]) -> Arrays:
-    return {name: value.double().numpy() for name, value in values.items()}
+    return native.nan_to_num(0.0), TrueImages(colors, torch.ge(share, 0.5), min_pixels)

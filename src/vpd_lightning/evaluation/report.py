@@ -13,13 +13,22 @@ from numpy.typing import NDArray
 from vpd_lightning.evaluation.evaluate import Evaluation
 from vpd_lightning.evaluation.events import events_of
 from vpd_lightning.evaluation.long_rollout import LongRollout
-from vpd_lightning.evaluation.measuring import SYSTEMS
 from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.evaluation.statistics import plain, pooled_psnr, summarize
 from vpd_lightning.files import AtomicPath
+from vpd_lightning.metrics.metric_info import MetricInfo
+from vpd_lightning.metrics.registry import (
+    HEADLINE,
+    REFERENCES,
+    SOURCES,
+    blocks,
+    image_metrics,
+    motion_metrics,
+    referenced,
+    references_of,
+)
 
 FORMAT_VERSION = 1
-IMAGE_METRICS = ("psnr", "psnr_moving", "ssim", "sharpness")
 
 
 def metrics_of(evaluation: Evaluation, protocol: Protocol, identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -27,10 +36,10 @@ def metrics_of(evaluation: Evaluation, protocol: Protocol, identity: Mapping[str
 
     Every metric is an object with ``mean`` (over images), ``ci95`` (bootstrap over trajectories) and ``per_step``;
     distances are metres; ``events`` are figures over bodies. Values that do not exist are null: a system without
-    particles has no ``chamfer``, ``motion``, ``events``, ``penetration`` and ``long_rollout``, one that predicts at the
-    resolution of the truth has no ``native``.
+    particles has no ``motion``, ``events`` and ``long_rollout`` and nothing else that is measured of particles, one
+    that predicts at the resolution of the truth has no ``native``.
     """
-    systems = {system: _image_summary(evaluation, protocol, system) for system in SYSTEMS}
+    systems = {system: _image_summary(evaluation, protocol, system) for system in SOURCES}
     summary = _summarizer(evaluation, protocol)
     return {
         "format_version": FORMAT_VERSION,
@@ -38,19 +47,18 @@ def metrics_of(evaluation: Evaluation, protocol: Protocol, identity: Mapping[str
         "protocol": {
             **protocol.as_dict(),
             "input_views": evaluation.input_views,
-            "num_views": int(evaluation.images["model"]["psnr"].shape[1]),
+            "num_views": int(evaluation.images["model"][HEADLINE].shape[1]),
             "num_clips": len(evaluation.clips),
             "num_trajectories": int(np.unique(evaluation.trajectory).size),
         },
         "finite": evaluation.finite,
         **systems["model"],
         "native": _native_summary(evaluation, protocol),
-        "chamfer": _parts_summary(evaluation.chamfer, summary),
+        **{info.name: _parts_summary(evaluation.blocks.get(info.name), summary) for info in blocks()},
         "reconstruction": {name: summary(values)["mean"] for name, values in evaluation.reconstruction.items()},
-        "references": {system: systems[system] for system in SYSTEMS if system != "model"},
+        "references": {system: systems[system] for system in REFERENCES},
         "motion": _motion_summary(evaluation, protocol),
         "events": events_of(evaluation.motion),
-        "penetration": _parts_summary(evaluation.penetration, summary),
         "long_rollout": _long_summary(evaluation.long_rollouts),
         "seconds": {name: plain(value) for name, value in evaluation.seconds.items()},
     }
@@ -62,15 +70,16 @@ def _summarizer(evaluation: Evaluation, protocol: Protocol) -> Any:
 
 def _image_summary(evaluation: Evaluation, protocol: Protocol, system: str) -> dict[str, Any]:
     summary, arrays = _summarizer(evaluation, protocol), evaluation.images[system]
-    num_views = arrays["psnr"].shape[1]
+    num_views = arrays[HEADLINE].shape[1]
     inputs = np.isin(np.arange(num_views), evaluation.input_views)
     result = {}
-    for name in IMAGE_METRICS:
-        result[name] = summary(arrays[name])
-        result[name]["input_views"] = summary(arrays[name][:, inputs])["mean"]
-        result[name]["other_views"] = summary(arrays[name][:, ~inputs])["mean"]
-    result["psnr"]["pooled"] = pooled_psnr(arrays["mse"])
-    result["psnr_moving"]["pooled"] = pooled_psnr(arrays["moving_mse"])
+    for info in image_metrics():
+        values = arrays[info.name]
+        result[info.name] = summary(values)
+        result[info.name]["input_views"] = summary(values[:, inputs])["mean"]
+        result[info.name]["other_views"] = summary(values[:, ~inputs])["mean"]
+        if info.pooled_part is not None:
+            result[info.name]["pooled"] = pooled_psnr(arrays[info.pooled_part])
     return result
 
 
@@ -79,15 +88,16 @@ def _native_summary(evaluation: Evaluation, protocol: Protocol) -> dict[str, Any
     if not evaluation.native:
         return None
     summary = _summarizer(evaluation, protocol)
-    means = {name: summary(evaluation.native[name])["mean"] for name in IMAGE_METRICS}
+    means = {info.name: summary(evaluation.native[info.name])["mean"] for info in image_metrics()}
     return {"resolution": evaluation.resolution, **means}
 
 
-def _parts_summary(parts: Mapping[str, NDArray[np.float64]], summary: Any) -> dict[str, Any] | None:
-    """Summarise the part called ``mean``; of the others only the mean counts."""
+def _parts_summary(parts: Mapping[str, NDArray[np.float64]] | None, summary: Any) -> dict[str, Any] | None:
+    """Summarise the first part, the metric itself; of the others only the mean counts."""
     if not parts:
         return None
-    return {**summary(parts["mean"]), **{name: summary(parts[name])["mean"] for name in parts if name != "mean"}}
+    first, *others = parts
+    return {**summary(parts[first]), **{name: summary(parts[name])["mean"] for name in others}}
 
 
 def _motion_summary(evaluation: Evaluation, protocol: Protocol) -> dict[str, Any] | None:
@@ -95,13 +105,19 @@ def _motion_summary(evaluation: Evaluation, protocol: Protocol) -> dict[str, Any
         return None
     summary = _summarizer(evaluation, protocol)
     result = {name: summary(values) for name, values in evaluation.motion.items()}
-    result["size_ratio"]["min"] = plain(np.nanmin(evaluation.motion["size_ratio"], initial=np.inf))
-    result["size_ratio"]["max"] = plain(np.nanmax(evaluation.motion["size_ratio"], initial=-np.inf))
-    for reference in ("constant", "copy", "velocity"):
-        result[f"centroid_error_over_{reference}"] = _ratio(
-            evaluation.motion["centroid_error"], evaluation.motion[f"centroid_error_{reference}"]
-        )
+    for info in motion_metrics():
+        if info.has_extremes:
+            result[info.name]["min"] = plain(np.nanmin(evaluation.motion[info.name], initial=np.inf))
+            result[info.name]["max"] = plain(np.nanmax(evaluation.motion[info.name], initial=-np.inf))
+    for info in referenced():
+        for reference in references_of(info):
+            result[ratio_name(reference)] = _ratio(evaluation.motion[info.name], evaluation.motion[reference.name])
     return result
+
+
+def ratio_name(reference: MetricInfo) -> str:
+    """Return the name of the ratio of a metric's errors to those of its reference: ``centroid_error_over_copy``."""
+    return f"{reference.reference_of}_over_{reference.name.removeprefix(f'{reference.reference_of}_')}"
 
 
 def _ratio(error: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[str, Any]:
@@ -181,11 +197,11 @@ def step_table(metrics: Mapping[str, Any]) -> dict[str, list[float | None]]:
     """Collect every per-step curve under a flat name; step 1 is the first predicted frame."""
     columns: dict[str, list[float | None]] = {}
     for system, values in (("model", metrics), *metrics["references"].items()):
-        for name in IMAGE_METRICS:
-            columns[f"{system}/{name}"] = values[name]["per_step"]
-    for name in ("chamfer", "penetration"):
-        if metrics[name]:
-            columns[f"model/{name}"] = metrics[name]["per_step"]
+        for info in image_metrics():
+            columns[f"{system}/{info.name}"] = values[info.name]["per_step"]
+    for info in blocks():
+        if metrics[info.name]:
+            columns[f"model/{info.name}"] = metrics[info.name]["per_step"]
     for name, values in (metrics["motion"] or {}).items():
         columns[f"motion/{name}"] = values["per_step"]
     return {"step": [step + 1 for step in range(metrics["protocol"]["num_steps"])], **columns}

@@ -1,7 +1,11 @@
 """The few lines a person reads after an evaluation."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+
+from vpd_lightning.evaluation.report import ratio_name
+from vpd_lightning.metrics.metric_info import MetricInfo
+from vpd_lightning.metrics.registry import REFERENCES, blocks, image_metrics, motion_metrics, still_scores
 
 
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
@@ -13,11 +17,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
         + ("" if metrics["finite"] else "  (NOT FINITE: some predictions are NaN or infinite)"),
         *_seen_lines(metrics),
         "",
-        f"{'':24}{'model':>9}{'copy last':>11}{'train mean':>12}{'gain':>8}",
-        _image_line("PSNR (dB)", metrics, "psnr", 2),
-        _image_line("  moving pixels (dB)", metrics, "psnr_moving", 2),
-        _image_line("SSIM", metrics, "ssim", 3),
-        _image_line("sharpness (truth: 1)", metrics, "sharpness", 2, has_gain=False),
+        *_image_lines(metrics),
         *_other_lines(metrics),
     ]
     if metrics["motion"]:
@@ -39,19 +39,17 @@ def _seen_lines(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _other_lines(metrics: Mapping[str, Any]) -> list[str]:
-    reconstruction, native = metrics["reconstruction"], metrics["native"]
-    lines = [
-        f"reconstruction of the last input frame: PSNR {_number(reconstruction['psnr'], 2)} dB, "
-        f"SSIM {_number(reconstruction['ssim'], 3)}"
-    ]
+    native = metrics["native"]
+    lines = [f"reconstruction of the last input frame: {_spoken(metrics['reconstruction'])}"]
     if native:
-        lines.append(
-            f"at its own {native['resolution']}x{native['resolution']} pixels, against the truth made as small: PSNR "
-            f"{_number(native['psnr'], 2)} dB, SSIM {_number(native['ssim'], 3)}"
-        )
-    parts = [("Chamfer", metrics["chamfer"]), ("deepest particle in floor or bodies", metrics["penetration"])]
-    known = [f"{name} {_number(_scaled(block['mean'], 100), 2)} cm" for name, block in parts if block]
+        size = f"{native['resolution']}x{native['resolution']}"
+        lines.append(f"at its own {size} pixels, against the truth made as small: {_spoken(native)}")
+    known = [info.spoken(metrics[info.name]["mean"]) for info in blocks() if info.in_summary and metrics[info.name]]
     return [*lines, "; ".join(known)] if known else lines
+
+
+def _spoken(means: Mapping[str, Any]) -> str:
+    return ", ".join(info.spoken(means[info.name]) for info in still_scores())
 
 
 def horizons(num_steps: int) -> list[int]:
@@ -64,39 +62,58 @@ def horizons(num_steps: int) -> list[int]:
     return [*chosen, num_steps] if num_steps > 1 else chosen
 
 
-def _image_line(label: str, metrics: Mapping[str, Any], name: str, digits: int, *, has_gain: bool = True) -> str:
-    model = metrics[name]["mean"]
-    references = [metrics["references"][system][name]["mean"] for system in ("copy_last", "train_mean")]
+def _image_lines(metrics: Mapping[str, Any]) -> list[str]:
+    infos = [info for info in image_metrics() if info.in_summary]
+    width = _label_width(info.label for info in infos)
+    return [
+        f"{'':{width}}{'model':>9}{'copy last':>11}{'train mean':>12}{'gain':>8}",
+        *(_image_line(info, width, metrics) for info in infos),
+    ]
+
+
+def _image_line(info: MetricInfo, width: int, metrics: Mapping[str, Any]) -> str:
+    model = metrics[info.name]["mean"]
+    references = [metrics["references"][source][info.name]["mean"] for source in REFERENCES]
+    copy, mean = (info.shown(value) for value in references)
+    return f"{info.label:{width}}{info.shown(model):>9}{copy:>11}{mean:>12}{_gain(info, model, references)}"
+
+
+def _gain(info: MetricInfo, model: float | None, references: Sequence[float | None]) -> str:
+    """By how much the model is better than the better reference; nothing where no distance says so."""
     known = [value for value in references if value is not None]
-    gain = f"{model - max(known):+8.{digits}f}" if model is not None and known else f"{'-':>8}"
-    gain = gain if has_gain else ""
-    copy, mean = (_number(value, digits) for value in references)
-    return f"{label:24}{_number(model, digits):>9}{copy:>11}{mean:>12}{gain}"
+    if not info.is_score:
+        return ""
+    if model is None or not known:
+        return f"{'-':>8}"
+    best = min(known, key=info.distance)
+    return f"{info.scale * (info.distance(best) - info.distance(model)):+8.{info.digits}f}"
 
 
 def _motion_lines(motion: Mapping[str, Any], num_steps: int) -> list[str]:
     steps = horizons(num_steps)
-    rows: list[tuple[str, str, float, int]] = [
-        ("centroid error (cm)", "centroid_error", 100.0, 1),
-        ("  best constant (cm)", "centroid_error_constant", 100.0, 1),
-        ("  nothing moves (cm)", "centroid_error_copy", 100.0, 1),
-        ("  velocity kept (cm)", "centroid_error_velocity", 100.0, 1),
-        ("  model / constant", "centroid_error_over_constant", 1.0, 2),
-        ("particle error (cm)", "particle_error", 100.0, 1),
-        ("orientation error (deg)", "orientation_error", 1.0, 1),
-        ("velocity error (cm/s)", "velocity_error", 100.0, 1),
-        ("block size / start", "size_ratio", 1.0, 2),
-        ("distance to surface (cm)", "body_chamfer", 100.0, 1),
-    ]
-    of_some = ("body_chamfer", "size_ratio", "orientation_error")  # soft or rigid bodies alone have them
-    rows = [row for row in rows if row[1] not in of_some or motion[row[1]]["count"]]
-    lines = [f"{'after step':24}" + "".join(f"{step:>9}" for step in steps)]
-    for label, name, scale, digits in rows:
-        values: Sequence[float | None] = motion[name]["per_step"]
-        lines.append(
-            f"{label:24}" + "".join(f"{_number(_scaled(values[step - 1], scale), digits):>9}" for step in steps)
-        )
-    return lines
+    rows = [row for info in motion_metrics() if info.in_summary for row in _motion_rows(info, motion)]
+    width = _label_width(label for label, _ in rows)
+    lines = [f"{'after step':{width}}" + "".join(f"{step:>9}" for step in steps)]
+    return lines + [f"{label:{width}}" + "".join(f"{cells[step - 1]:>9}" for step in steps) for label, cells in rows]
+
+
+def _motion_rows(info: MetricInfo, motion: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
+    """A metric by step, those of its references indented, and behind them the ratio to one that sees no input."""
+    if not motion[info.name]["count"]:  # rigid or soft bodies alone have some of them
+        return []
+    cells = [info.shown(value) for value in motion[info.name]["per_step"]]
+    if info.reference_of is None:
+        return [(info.label, cells)]
+    rows = [(f"  {info.label}", cells)]
+    ratios = motion.get(ratio_name(info))
+    if ratios is not None and not info.sees_input:
+        label = f"  model / {info.name.removeprefix(f'{info.reference_of}_')}"
+        rows.append((label, ["-" if value is None else f"{value:.2f}" for value in ratios["per_step"]]))
+    return rows
+
+
+def _label_width(labels: Iterable[str]) -> int:
+    return max((len(label) for label in labels), default=0) + 1
 
 
 def _event_lines(events: Mapping[str, Any]) -> list[str]:

@@ -15,9 +15,9 @@ class AbstractLoss(nn.Module, ABC):
     weight: float
 
     @property
-    def measured(self) -> dict[str, Tensor]:
-        """What the last call measured beside its value, by the name under which it is logged; without gradients."""
-        return {}
+    def metrics(self) -> dict[str, Tensor]:
+        """What the last call computed beside its value, by the name under which it is logged; without gradients."""
+        return getattr(self, "measured", {})  # the older name, which losses of other packages may have
 
     @abstractmethod
     def forward(self, output: SimulatorOutput, batch: VideoBatch) -> Float[Tensor, ""]:

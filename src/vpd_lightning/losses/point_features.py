@@ -23,12 +23,12 @@ class PointFeatureLoss(AbstractLoss):
         if weight < 0 or min_mass < 0:
             raise ValueError(f"weight and min_mass must not be negative, got weight={weight}, min_mass={min_mass}")
         self.weight, self.min_mass = weight, min_mass
-        self._measured: dict[str, Tensor] = {}
+        self._metrics: dict[str, Tensor] = {}
 
     @property
-    def measured(self) -> dict[str, Tensor]:
+    def metrics(self) -> dict[str, Tensor]:
         """The loss of the last call at points near particles; 0 where there were none."""
-        return self._measured
+        return self._metrics
 
     def forward(self, output: SimulatorOutput, batch: VideoBatch) -> Float[Tensor, ""]:
         """Return the error over ``predicted_features`` and ``target_features`` (``batch time point feature``).
@@ -45,5 +45,5 @@ class PointFeatureLoss(AbstractLoss):
         squared = (output.auxiliary["predicted_features"] - output.auxiliary["target_features"]).square()
         near = output.auxiliary["point_mass"] > self.min_mass
         at_points = squared.detach().mean(dim=-1)
-        self._measured = {"point_features_near": (at_points * near).sum() / near.sum().clamp(min=1)}
+        self._metrics = {"point_features_near": (at_points * near).sum() / near.sum().clamp(min=1)}
         return squared.mean()

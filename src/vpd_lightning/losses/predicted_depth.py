@@ -26,12 +26,12 @@ class PredictedDepthLoss(AbstractLoss):
         if weight < 0 or far <= 0:
             raise ValueError(f"weight must not be negative and far must be above 0, got weight={weight}, far={far}")
         self.weight, self.far = weight, far
-        self._measured: dict[str, Tensor] = {}
+        self._metrics: dict[str, Tensor] = {}
 
     @property
-    def measured(self) -> dict[str, Tensor]:
+    def metrics(self) -> dict[str, Tensor]:
         """The error of the last call in metres."""
-        return self._measured
+        return self._metrics
 
     def forward(self, output: SimulatorOutput, batch: VideoBatch) -> Float[Tensor, ""]:
         """Return the error.
@@ -49,5 +49,5 @@ class PredictedDepthLoss(AbstractLoss):
         valid = torch.isfinite(truth) & (truth > 0) & (truth <= self.far)
         error = torch.where(valid, predicted - torch.where(valid, truth, 0.0), 0.0).flatten(1)
         count = valid.flatten(1).sum(dim=1).clamp(min=1)
-        self._measured = {"predicted_depth_error": (error.detach().abs().sum(dim=1) / count).mean()}
+        self._metrics = {"predicted_depth_error": (error.detach().abs().sum(dim=1) / count).mean()}
         return (error.square().sum(dim=1) / count).mean()

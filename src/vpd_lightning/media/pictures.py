@@ -1,6 +1,7 @@
 """Pictures in reports: curves over the steps, contact sheets of predictions, plots of particles."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -11,38 +12,40 @@ from numpy.typing import NDArray
 
 from vpd_lightning.files import AtomicPath
 from vpd_lightning.media.video import enlarge, error_image, framed, label_bar
+from vpd_lightning.metrics.registry import referenced, references_of, scores
 
-_STYLES = {
+_STYLES: dict[str, dict[str, Any]] = {
     "model": {"color": "#1f5fbf", "linewidth": 2.2, "label": "model"},
     "copy_last": {"color": "#d0762a", "linewidth": 1.4, "linestyle": "--", "label": "copy last input frame"},
     "train_mean": {"color": "#777777", "linewidth": 1.4, "linestyle": ":", "label": "training mean"},
 }
-_MOTION_STYLES = {
-    "centroid_error": {"color": "#1f5fbf", "linewidth": 2.2, "label": "model"},
-    "centroid_error_constant": {"color": "#777777", "linewidth": 1.4, "linestyle": ":", "label": "best constant"},
-    "centroid_error_copy": {"color": "#d0762a", "linewidth": 1.4, "linestyle": "--", "label": "nothing moves"},
-}
+_MOTION_STYLES: tuple[dict[str, Any], ...] = tuple(
+    {key: value for key, value in style.items() if key != "label"} for style in _STYLES.values()
+)
 
 
 def write_curves(path: Path, table: Mapping[str, Sequence[float | None]]) -> None:
-    """Draw PSNR, moving-pixel PSNR, SSIM and centroid error over the predicted steps.
+    """Draw the scores of images, and the errors of bodies beside what needs no model, over the predicted steps.
 
     ``table`` is that of ``evaluation.report.step_table``; a value that does not exist is None and leaves a gap.
     """
-    panels = [("psnr", "PSNR (dB)"), ("psnr_moving", "PSNR on moving pixels (dB)"), ("ssim", "SSIM")]
-    has_motion = "motion/centroid_error" in table
-    figure = Figure(figsize=(4.2 * (3 + has_motion), 3.4), layout="constrained")
-    axes = figure.subplots(1, 3 + has_motion, squeeze=False)[0]
-    for axis, (name, title) in zip(axes, panels, strict=False):
-        for system, style in _STYLES.items():
-            axis.plot(table["step"], _curve(table[f"{system}/{name}"]), marker=_marker(table), **style)
-        axis.set_title(title)
-    if has_motion:
-        for name, style in _MOTION_STYLES.items():
-            axes[-1].plot(table["step"], 100 * _curve(table[f"motion/{name}"]), marker=_marker(table), **style)
-        axes[-1].set_title("centroid error (cm)")
-        axes[-1].set_ylim(bottom=0)
-        axes[-1].legend(fontsize=8)
+    motion = [info for info in referenced() if f"motion/{info.name}" in table]
+    figure = Figure(figsize=(4.2 * (len(scores()) + len(motion)), 3.4), layout="constrained")
+    axes = figure.subplots(1, len(scores()) + len(motion), squeeze=False)[0]
+    for axis, info in zip(axes, scores(), strict=False):
+        for source, style in _STYLES.items():
+            curve = info.scale * _curve(table[f"{source}/{info.name}"])
+            axis.plot(table["step"], curve, marker=_marker(table), **style)
+        axis.set_title(info.label)
+    for axis, info in zip(axes[len(scores()) :], motion, strict=True):
+        blind = [other for other in references_of(info) if not other.sees_input]
+        labels = {info.name: "model", **{other.name: other.title for other in blind}}
+        for (name, label), style in zip(labels.items(), cycle(_MOTION_STYLES), strict=False):
+            curve = info.scale * _curve(table[f"motion/{name}"])
+            axis.plot(table["step"], curve, marker=_marker(table), label=label, **style)
+        axis.set_title(info.label)
+        axis.set_ylim(bottom=0)
+        axis.legend(fontsize=8)
     for axis in axes:
         axis.set_xlabel("predicted step")
         axis.grid(alpha=0.3)

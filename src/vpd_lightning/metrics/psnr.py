@@ -4,8 +4,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vpd_lightning.metrics.true_images import TrueImages
+
 PSNR_CAP = 100.0
-"""An identical pair has infinite PSNR; averages over images count it as this many dB (see ``psnr_of``)."""
+"""An identical pair has infinite PSNR; averages over images count it as this many dB (see ``psnr_of_images``)."""
 
 
 def mean_squared_error(
@@ -47,3 +49,25 @@ def masked_psnr(
     """PSNR in dB over the pixels of ``mask``; NaN for images with fewer than ``min_pixels`` of them."""
     values = psnr_of(mean_squared_error(pred, target, mask))
     return torch.where(mask.sum((-2, -1)) >= min_pixels, values, torch.full_like(values, torch.nan))
+
+
+def psnr_of_images(
+    pred: Float[Tensor, "step_or_1 view height width 3"], truth: TrueImages
+) -> dict[str, Float[Tensor, "step view"]]:
+    """PSNR and mean squared error of every image; a prediction of one step stands for all steps.
+
+    PSNR is cut at ``PSNR_CAP`` dB, so that one exact image (a scene at rest, copied) does not make a mean infinite.
+    """
+    mse = mean_squared_error(pred.expand_as(truth.colors), truth.colors)
+    return {"psnr": psnr_of(mse).clamp(max=PSNR_CAP), "mse": mse}
+
+
+def psnr_of_moving_pixels(
+    pred: Float[Tensor, "step_or_1 view height width 3"], truth: TrueImages
+) -> dict[str, Float[Tensor, "step view"]]:
+    """The same over the moving pixels; NaN for an image with fewer than ``truth.min_moving_pixels`` of them."""
+    assert truth.moving is not None
+    mse = mean_squared_error(pred.expand_as(truth.colors), truth.colors, truth.moving)
+    enough = truth.moving.sum((-2, -1)) >= truth.min_moving_pixels
+    mse = torch.where(enough, mse, torch.full_like(mse, torch.nan))
+    return {"psnr_moving": psnr_of(mse).clamp(max=PSNR_CAP), "moving_mse": mse}

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vpd_lightning.metrics.true_images import TrueImages
+
 _LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
 _FLAT = 1e-3  # of 1; an image with less than this mean gradient has no structure (one 8-bit step is 4e-3)
 _MOST = 10.0  # one image must not decide a mean
@@ -29,3 +31,10 @@ def sharpness(
     blurred, sharp = gradient_magnitude(pred.clamp(0.0, 1.0)), gradient_magnitude(target)
     both_flat = torch.where(blurred < _FLAT, torch.ones_like(sharp), torch.full_like(sharp, torch.nan))
     return torch.where(sharp < _FLAT, both_flat, (blurred / sharp.clamp(min=_FLAT)).clamp(max=_MOST))
+
+
+def sharpness_of_images(
+    pred: Float[Tensor, "step_or_1 view height width 3"], truth: TrueImages
+) -> Float[Tensor, "step view"]:
+    """Return the sharpness of every image (see ``sharpness``)."""
+    return sharpness(pred, truth.colors)

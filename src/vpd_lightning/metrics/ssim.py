@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vpd_lightning.metrics.true_images import TrueImages
+
 KERNEL_SIZE = 11
 _SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2  # of values in [0, 1]
@@ -63,6 +65,15 @@ def ssim(
         ValueError: the images are smaller than the window.
     """
     return ssim_of(local_moments(pred.clamp(0.0, 1.0)), local_moments(target))
+
+
+def ssim_of_images(
+    pred: Float[Tensor, "step_or_1 view height width 3"], truth: TrueImages
+) -> Float[Tensor, "step view"]:
+    """SSIM of every image; NaN where images are smaller than the window."""
+    if min(truth.colors.shape[-3:-1]) < KERNEL_SIZE:
+        return truth.colors.new_full(truth.colors.shape[:2], torch.nan)
+    return ssim_of(local_moments(pred.clamp(0.0, 1.0)), truth.once(local_moments))
 
 
 def _blurred(maps: Float[Tensor, "*map height width"]) -> Float[Tensor, "*map inner_height inner_width"]:

@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+import torch
+from jaxtyping import Float, Float64, Int64
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 Array = NDArray[np.float64]
 _NUM_CANDIDATES = 16  # triangles with the nearest centres; the nearest triangle of a mesh of even size is among them
@@ -40,6 +42,14 @@ def nearest_on_surface(points: Float64[np.ndarray, "point 3"], corners: Array) -
     best = distance.argmin(axis=1)
     rows = np.arange(len(points))
     return SurfacePoints(candidates[rows, best].astype(np.int64), weights[rows, best], distance[rows, best])
+
+
+def surface_errors(
+    pred: Float[Tensor, "step particle 3"], surface: Float[Tensor, "step triangle 3 3"]
+) -> Float[Tensor, " step"]:
+    """Mean distance in metres from each step's points to the true surface of that step."""
+    pairs = zip(pred.numpy(), surface.numpy(), strict=True)
+    return torch.tensor([nearest_on_surface(points, corners).distance.mean() for points, corners in pairs])
 
 
 def _nearest_on_triangle(points: Array, corners: Array) -> tuple[Array, Array]:

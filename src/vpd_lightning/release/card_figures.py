@@ -3,9 +3,16 @@
 from collections.abc import Mapping
 from typing import Any
 
-REFERENCES = ("copy_last", "train_mean")
-SCORES = (("PSNR (dB)", "psnr", 2), ("PSNR of moving pixels (dB)", "psnr_moving", 2), ("SSIM", "ssim", 3))
-"""Label, name in ``metrics.json`` and digits of what is higher where a prediction is better."""
+from vpd_lightning.metrics.metric_info import MetricInfo
+from vpd_lightning.metrics.registry import (
+    REFERENCES,
+    blocks,
+    image_metrics,
+    metric,
+    referenced,
+    references_of,
+    still_scores,
+)
 
 
 def figure_lines(metrics: Mapping[str, Any]) -> list[str]:
@@ -24,20 +31,18 @@ def figure_lines(metrics: Mapping[str, Any]) -> list[str]:
         "| | model | 95 % interval | last frame repeated | training mean |",
         "|---|---:|---:|---:|---:|",
     ]
-    lines += [row for label, name, digits in SCORES for row in _image_rows(metrics, label, name, digits)]
-    lines += _image_rows(metrics, "sharpness (truth: 1)", "sharpness", 2)
-    lines += _single_row("Chamfer distance (cm)", metrics.get("chamfer"), 100.0, 2)
-    lines += _single_row("deepest particle in floor or bodies (cm)", metrics.get("penetration"), 100.0, 2)
-    motion = metrics.get("motion") or {}
-    lines += _single_row("centroid error of bodies (cm)", motion.get("centroid_error"), 100.0, 1)
-    others = _centroid_references(motion)
-    if others:
-        words = " and ".join(f"{what} {100 * error:.1f} cm" for what, error in others.items())
-        lines += ["", f"Centroid error of two references that see nothing: {words}."]
+    lines += [row for info in image_metrics() for row in _image_rows(metrics, info)]
+    lines += [row for info in (*blocks(), *referenced()) for row in _single_row(metrics, info)]
+    for info in referenced():
+        others = _blind_references(info, metrics)
+        if others:
+            words = " and ".join(other.spoken(found) for other, found in others.items())
+            count = "two references" if len(others) == 2 else "references"
+            lines += ["", f"{short_title(info).capitalize()} of {count} that see nothing: {words}."]
     native = metrics.get("native")
     if native:
-        value = f"{_number(native['psnr'], 2)} dB, SSIM {_number(native['ssim'], 3)}"
-        lines += ["", f"At the resolution it was trained at ({native['resolution']} pixels): PSNR {value}."]
+        words = ", ".join(info.spoken(native.get(info.name)) for info in still_scores() if info.name in native)
+        lines += ["", f"At the resolution it was trained at ({native['resolution']} pixels): {words}."]
     return lines
 
 
@@ -48,47 +53,59 @@ def _doubt(seen: int | None) -> list[str]:
     return ["", f"**{seen} of these trajectories were trained on.**"] if seen else []
 
 
+def short_title(info: MetricInfo) -> str:
+    """The title within a sentence that says whose it is."""
+    return info.title.removesuffix(" of bodies")
+
+
 def beaten_by(metrics: Mapping[str, Any], name: str) -> list[str]:
-    """Return the references whose mean of a figure is as high as the model's, or higher."""
-    own = (metrics.get(name) or {}).get("mean")
+    """Return the references whose mean of a score of images is as good as the model's, or better."""
+    info = metric(name)
+    own = (metrics.get(info.name) or {}).get("mean")
     words = {"copy_last": "repeating the last frame", "train_mean": "the training mean"}
-    means = {reference: metrics["references"][reference][name]["mean"] for reference in REFERENCES}
-    return [words[key] for key, mean in means.items() if own is not None and mean is not None and mean >= own]
+    means = {source: (metrics["references"][source].get(info.name) or {}).get("mean") for source in REFERENCES}
+    if own is None:
+        return []
+    known = {source: mean for source, mean in means.items() if mean is not None}
+    return [words[source] for source, mean in known.items() if info.distance(mean) <= info.distance(own)]
 
 
-def beaten_in_motion_by(metrics: Mapping[str, Any]) -> list[str]:
-    """Return the references of the bodies' motion whose centroid error is as low as the model's, or lower."""
-    motion = metrics.get("motion") or {}
-    own = (motion.get("centroid_error") or {}).get("mean")
-    return [what for what, error in _centroid_references(motion).items() if own is not None and error <= own]
+def beaten_in_motion_by(metrics: Mapping[str, Any], name: str) -> list[str]:
+    """Return the references of the bodies' motion whose error is as low as the model's, or lower."""
+    info = metric(name)
+    summary = info.summary(metrics)
+    if summary is None:
+        return []
+    return [other.title for other, error in _blind_references(info, metrics).items() if error <= summary["mean"]]
 
 
-def _centroid_references(motion: Mapping[str, Any]) -> dict[str, float]:
-    """Mean centroid error in metres of what does not look at the input, as far as known."""
-    names = {"no motion": "centroid_error_copy", "the best constant displacement": "centroid_error_constant"}
-    means = {what: (motion.get(name) or {}).get("mean") for what, name in names.items()}
-    return {what: mean for what, mean in means.items() if mean is not None}
+def _blind_references(info: MetricInfo, metrics: Mapping[str, Any]) -> dict[MetricInfo, float]:
+    """Mean error of what does not look at the input, as far as known."""
+    summaries = {other: other.summary(metrics) for other in references_of(info) if not other.sees_input}
+    return {other: summary["mean"] for other, summary in summaries.items() if summary is not None}
 
 
-def _image_rows(metrics: Mapping[str, Any], label: str, name: str, digits: int) -> list[str]:
+def _image_rows(metrics: Mapping[str, Any], info: MetricInfo) -> list[str]:
+    name, digits = info.name, info.digits
     if not metrics.get(name):
         return []
     rows = []
-    references = [metrics["references"][reference][name] for reference in REFERENCES]
+    references = [metrics["references"][reference].get(name) or {} for reference in REFERENCES]
     picks = [("", "mean")]
     if metrics[name].get("other_views") is not None:
         picks += [(", input cameras", "input_views"), (", other cameras", "other_views")]
     for suffix, key in picks:
         interval = _interval(metrics[name], 1.0, digits) if key == "mean" else ""
         cells = [_number(metrics[name][key], digits), interval, *(_number(r.get(key), digits) for r in references)]
-        rows.append(f"| {label}{suffix} | {' | '.join(cells)} |")
+        rows.append(f"| {info.label}{suffix} | {' | '.join(cells)} |")
     return rows
 
 
-def _single_row(label: str, block: Mapping[str, Any] | None, scale: float, digits: int) -> list[str]:
-    if not block or block.get("mean") is None:
+def _single_row(metrics: Mapping[str, Any], info: MetricInfo) -> list[str]:
+    block = info.summary(metrics)
+    if block is None:
         return []
-    return [f"| {label} | {_number(scale * block['mean'], digits)} | {_interval(block, scale, digits)} | | |"]
+    return [f"| {info.label} | {info.shown(block['mean'])} | {_interval(block, info.scale, info.digits)} | | |"]
 
 
 def _interval(block: Mapping[str, Any], scale: float, digits: int) -> str:

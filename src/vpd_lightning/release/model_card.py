@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vpd_lightning.release.card_figures import SCORES, beaten_by, beaten_in_motion_by, figure_lines
+from vpd_lightning.metrics.registry import HEADLINE, referenced, scores
+from vpd_lightning.release.card_figures import beaten_by, beaten_in_motion_by, figure_lines, short_title
 from vpd_lightning.release.system_notes import describe_system, reads_depth, renders_any_camera
 
 
@@ -165,14 +166,13 @@ def _limit_lines(content: CardContent) -> list[str]:
         "- Image averages hide much, because most of a picture stands still: look at the moving pixels.",
         "- The figures compare within this project, on this data set, and not with the paper's tables.",
     ]
-    for label, name, _ in SCORES:
-        lines += [
-            f"- **By {label.partition(' (')[0]} it does not beat {what}.**" for what in beaten_by(content.metrics, name)
-        ]
-    lines += [f"- **By centroid error it does not beat {what}.**" for what in beaten_in_motion_by(content.metrics)]
+    metrics = content.metrics
+    beaten = [(info, what) for info in scores() for what in beaten_by(metrics, info.name)]
+    beaten += [(info, what) for info in referenced() for what in beaten_in_motion_by(metrics, info.name)]
+    lines += [f"- **By {short_title(info)} it does not beat {what}.**" for info, what in beaten]
     if not renders_any_camera(system):
         lines.append("- It predicts the views it is given and no others.")
-    elif content.metrics["psnr"].get("other_views") is None:
+    elif metrics[HEADLINE].get("other_views") is None:
         lines.append("- All cameras of its data set are inputs: the figures say nothing of new views.")
     return lines
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.errors import CheckpointError, ConfigError
+from vpd_lightning.metrics.registry import HEADLINE, blocks, image_metrics
 from vpd_lightning.release.model_card import CardContent, model_card
 from vpd_lightning.release.portable import absolute_paths, portable_config, portable_metrics
 from vpd_lightning.release.release_folder import (
@@ -65,7 +66,7 @@ def find_metrics(trained: TrainedSystem, metrics_file: str | None) -> dict[str, 
         ) from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read: {error}.\nGive metrics=FILE, as vpd-eval writes it.") from error
-    wanted = ("checkpoint_sha256", "protocol", "psnr", "references")
+    wanted = ("checkpoint_sha256", "protocol", HEADLINE, "references")
     missing = [name for name in wanted if not isinstance(metrics, dict) or name not in metrics]
     if missing:
         raise ConfigError(f"{path} lacks {', '.join(missing)}.\nGive metrics=FILE, as vpd-eval writes it.")
@@ -85,20 +86,20 @@ def _wrong_entry(metrics: Mapping[str, Any]) -> str | None:
     """Return the name of an entry that a card needs and that is of another kind."""
     kinds: dict[str, tuple[Any, Any]] = {"protocol": (metrics["protocol"], Mapping)}
     kinds["checkpoint_sha256"] = (metrics["checkpoint_sha256"], str)
-    for name in ("psnr", "psnr_moving", "ssim", "sharpness"):
-        if name in metrics:
-            kinds[name] = (metrics[name], Mapping)
+    for info in image_metrics():
+        if info.name in metrics:
+            kinds[info.name] = (metrics[info.name], Mapping)
     references = metrics["references"]
     kinds["references"] = (references, Mapping)
     for name in references if isinstance(references, Mapping) else ():
         kinds[f"references.{name}"] = (references[name], Mapping)
-    for name in ("chamfer", "motion", "native", "penetration", "long_rollout"):
+    for name in (*(info.name for info in blocks()), "motion", "native", "long_rollout"):
         kinds[name] = (metrics.get(name), Mapping | None)
     wrong = next((name for name, (value, kind) in kinds.items() if not isinstance(value, kind)), None)
     if wrong is not None:
         return wrong
-    mean = metrics["psnr"].get("mean")
-    return None if isinstance(mean, int | float) and not isinstance(mean, bool) else "psnr.mean"
+    mean = metrics[HEADLINE].get("mean")
+    return None if isinstance(mean, int | float) and not isinstance(mean, bool) else f"{HEADLINE}.mean"
 
 
 def _require_plain_test(metrics: Mapping[str, Any], path: Path, checkpoint: Path) -> None:
@@ -145,7 +146,7 @@ def write_release(
         "seed": config.get("seed"),
         "step": trained.step,
         "num_parameters": num_parameters,
-        "psnr": figures["psnr"]["mean"],
+        HEADLINE: figures[HEADLINE]["mean"],
         "sha256": {file: sha256(content[file]) for file in CHECKED_FILES} | _program_digest(folder),
         TRAINED_ON: None if trained.trained_on is None else sorted(trained.trained_on),
     }

@@ -11,6 +11,7 @@ import yaml
 
 from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.errors import CheckpointError
+from vpd_lightning.metrics.registry import HEADLINE
 from vpd_lightning.release.portable import absolute_paths
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def read_index(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path} has format version {version!r}; this program reads version {FORMAT_VERSION}.")
     digests = index.get("sha256")
     is_whole = isinstance(digests, dict) and all(isinstance(digests.get(name), str) for name in CHECKED_FILES)
-    wanted = {"name": str, "system": str, "experiment": str, "step": int, "num_parameters": int, "psnr": int | float}
+    wanted = {"name": str, "system": str, "experiment": str, "step": int, "num_parameters": int, HEADLINE: int | float}
     wrong = [
         name for name, kind in wanted.items() if not isinstance(index.get(name), kind) or isinstance(index[name], bool)
     ]

@@ -13,12 +13,16 @@ from vpd_lightning.data.trained_on import DATA_SHA256, TRAINED_ON
 from vpd_lightning.data.validation import VideoClip
 from vpd_lightning.errors import ConfigError, NonFiniteError
 from vpd_lightning.losses.base import AbstractLoss
-from vpd_lightning.metrics.psnr import mean_squared_error, psnr, psnr_of
+from vpd_lightning.metrics.psnr import mean_squared_error, psnr_of
+from vpd_lightning.metrics.registry import HEADLINE, PSNR, metric
+from vpd_lightning.metrics.sample_metric import SampleMetric
+from vpd_lightning.metrics.true_images import TrueImages
 from vpd_lightning.system import AbstractSystem
 from vpd_lightning.training.optimization import AbstractOptimization
 from vpd_lightning.types import VideoBatch, ViewBatch
 
-BEST_METRIC = "validation/psnr"
+VALIDATION = "validation/"
+BEST_METRIC = f"{VALIDATION}{HEADLINE}"
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +56,8 @@ class VPDModule(pl.LightningModule):
         self.simulator = simulator
         self.losses = nn.ModuleList(losses)
         self.optimization = optimization
+        self.validation_metric = SampleMetric(metric(HEADLINE))
+        self.validation_metric_last_step = SampleMetric(metric(HEADLINE), last_step_only=True)
         self.train_metrics: dict[str, Tensor | float] = {}
         self.expected_steps: Callable[[], int] | None = None
         self._clips: Sequence[str] = ()
@@ -118,11 +124,11 @@ class VPDModule(pl.LightningModule):
         self.train_metrics = {
             "loss": total.detach(),
             **{f"loss/{name}": part.detach() for name, part in parts.items()},
-            **{name: value for loss in self.losses for name, value in loss.measured.items()},  # type: ignore[operator,union-attr]
+            **{name: value for loss in self.losses for name, value in loss.metrics.items()},  # type: ignore[operator,union-attr]
         }
         if output.rendered is not None:
             error = mean_squared_error(output.rendered.rgbs.detach().float(), batch.rgbs.float())
-            self.train_metrics["psnr"] = psnr_of(error).mean()
+            self.train_metrics[PSNR] = psnr_of(error).mean()
         if self.seconds_per_step is not None:
             rays = batch.rgbs.shape[:-1].numel() * self.trainer.world_size
             self.train_metrics["rays_per_second"] = rays / self.seconds_per_step
@@ -177,16 +183,18 @@ class VPDModule(pl.LightningModule):
         clip = clip.to(self._parameter_dtype())
         target = clip.target
         prediction = self.simulator.predict_frames(clip.context, target.cameras).float()
-        values = psnr(prediction, target.rgb.float() / 255.0)
         if not torch.isfinite(prediction).all():
             raise NonFiniteError(
                 f"The prediction for {clip.name} is not finite, after step {self.global_step}.\n"
                 "Lower optimizer.lr or set trainer.gradient_clip_val."
             )
-        metrics = {BEST_METRIC: values.mean(), "validation/psnr_last_step": values[-1].mean()}
-        # Averages over clips, each counted once on whatever device it was.
-        self.log_dict(metrics, on_step=False, on_epoch=True, sync_dist=True, batch_size=1, logger=False)
-        return {"prediction": prediction, "psnr": values}
+        # Each clip counts once, on whatever device it was; with one device and with several the same.
+        truth = TrueImages(target.rgb.float() / 255.0)
+        metrics = {BEST_METRIC: self.validation_metric, f"{BEST_METRIC}_last_step": self.validation_metric_last_step}
+        for each in metrics.values():
+            each.update(clip.number, prediction, truth)
+        self.log_dict(metrics, on_step=False, on_epoch=True, batch_size=1, logger=False)
+        return {"prediction": prediction}
 
 
 def _learning_rates(optimizer: torch.optim.Optimizer) -> dict[str, Tensor | float]:

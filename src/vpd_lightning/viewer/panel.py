@@ -9,6 +9,7 @@ import numpy as np
 import viser
 
 from vpd_lightning.errors import VPDError
+from vpd_lightning.metrics.registry import CHAMFER, PSNR, metric
 from vpd_lightning.viewer.edit_tab import EditTab
 from vpd_lightning.viewer.export_tab import ExportTab
 from vpd_lightning.viewer.exports import ExportFolder, as_pose
@@ -188,8 +189,9 @@ class Panel:
         figures = self.session.measure(step, view, image)
         lines = [f"step **{step}** of {self.session.now.num_steps}, {int(figures['particles'])} particles"]
         if known:
-            lines.append(f"camera {view}: PSNR **{figures['psnr']:.2f} dB**")
-            lines.append(f"to measured points: **{100 * figures['chamfer']:.1f} cm** (Chamfer)")
+            seen, near = metric(PSNR), metric(CHAMFER)
+            lines.append(f"camera {view}: {seen.title} **{seen.shown(figures[PSNR])} {seen.printed_unit}**")
+            lines.append(f"to measured points: **{near.shown(figures[CHAMFER])} {near.printed_unit}** ({near.title})")
         else:
             lines.append("behind the end of the recording")
         self.figures.content = "  \n".join(lines)

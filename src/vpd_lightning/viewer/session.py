@@ -17,6 +17,7 @@ from vpd_lightning.editing.selectors import Selector
 from vpd_lightning.errors import EditError
 from vpd_lightning.metrics.chamfer import chamfer
 from vpd_lightning.metrics.psnr import psnr
+from vpd_lightning.metrics.registry import CHAMFER, PSNR
 from vpd_lightning.types import Cameras, Particles
 from vpd_lightning.viewer.opened_scene import OpenedScene
 
@@ -186,9 +187,9 @@ class Session:
                 torch.from_numpy(np.ascontiguousarray(part)).float() / 255
                 for part in (image, self.opened.truth[step, view])
             )
-            figures["psnr"] = float(psnr(*pair))
+            figures[PSNR] = float(psnr(*pair))
             points, _ = self.opened.seen_points(step)
-            figures["chamfer"] = chamfer(state.positions[0][state.mask[0]], torch.from_numpy(points)).mean
+            figures[CHAMFER] = chamfer(state.positions[0][state.mask[0]], torch.from_numpy(points)).mean
         return figures
 
     def operations(self) -> Sequence[Operation]:

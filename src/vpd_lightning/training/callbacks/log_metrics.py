@@ -5,7 +5,7 @@ from typing import Any
 import lightning.pytorch as pl
 
 from vpd_lightning.training.metrics_csv import MetricsCSV
-from vpd_lightning.training.module import VPDModule
+from vpd_lightning.training.module import VALIDATION, VPDModule
 from vpd_lightning.types import VideoBatch, ViewBatch
 
 
@@ -39,7 +39,7 @@ class LogMetrics(pl.Callback):
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Log a validation."""
         if not trainer.sanity_checking and trainer.state.fn == "fit":
-            found = {k: v for k, v in trainer.callback_metrics.items() if k.startswith("validation/")}
+            found = {k: v for k, v in trainer.callback_metrics.items() if k.startswith(VALIDATION)}
             _log(trainer, found, trainer.global_step)
 
 

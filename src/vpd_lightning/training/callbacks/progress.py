@@ -6,6 +6,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 
+from vpd_lightning.metrics.registry import HEADLINE, metric
 from vpd_lightning.training.module import BEST_METRIC, VPDModule
 from vpd_lightning.types import VideoBatch, ViewBatch
 
@@ -76,7 +77,7 @@ class Progress(pl.Callback):
         """Show the validation's PSNR."""
         score = trainer.callback_metrics.get(BEST_METRIC)
         if self._is_active and score is not None and trainer.state.fn == "fit" and not trainer.sanity_checking:
-            self._print(f"validation after step {trainer.global_step}: PSNR {float(score):.2f} dB")
+            self._print(f"validation after step {trainer.global_step}: {metric(HEADLINE).spoken(float(score))}")
 
     def _line(self, trainer: pl.Trainer, module: VPDModule) -> str:
         step, metrics = trainer.global_step, module.train_metrics
@@ -91,7 +92,8 @@ class Progress(pl.Callback):
                 parts += [f"{float(metrics['rays_per_second']):,.0f} rays/s"]
             parts += [f"ETA {clock(seconds * (total - step))}"]
         parts += [f"{name} {float(metrics['loss']):.5f}" for name in ("loss",) if name in metrics]
-        parts += [f"PSNR {float(metrics['psnr']):.2f}" for name in ("psnr",) if name in metrics]
+        info = metric(HEADLINE)
+        parts += [f"{info.title} {info.shown(float(metrics[name]))}" for name in (HEADLINE,) if name in metrics]
         return "  ".join(parts)
 
     def _print(self, line: str) -> None:
