@@ -140,6 +140,8 @@ class Simulator(AbstractSystem):
     def _add_location_noise(self, particles: Particles, keys: RandomKeys, rollout_step: int) -> Particles:
         if not self.training or self.location_noise == 0:
             return particles
+        # Paper: noise on locations in training, and no more is said. Here it comes before each step, on the current
+        # particles alone; the predicted ones are offsets from those, so over a rollout it adds up to a random walk.
         shape = particles.positions.shape[1:]
         noise = torch.stack([torch.randn(shape, generator=g) for g in keys.generators(f"noise/{rollout_step}")])
         return replace(particles, positions=particles.positions + self.location_noise * noise.to(particles.positions))

@@ -121,7 +121,7 @@ def test_checkpointed_and_plain_gradients_agree() -> None:
 def test_it_learns_a_tiny_recording_and_tells_its_frames_apart() -> None:
     simulator, starts = simulator_of().train(), (0, 1, 2, 3)
     loss_of = PixelLoss(weight=1.0, coarse_weight=1.0)
-    rates = {"encoder": 2e-4, "dynamics": 2e-4, "renderer": 2e-3}  # of conf/tuning/small_global.yaml
+    rates = {"encoder": 2e-4, "dynamics": 2e-4, "renderer": 2e-3}  # of conf/recipe/small/global.yaml
     groups = [{"params": getattr(simulator, name).parameters(), "lr": rate} for name, rate in rates.items()]
     optimizer = torch.optim.Adam(groups)
     for step in range(60):

@@ -6,8 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
+from vpd_lightning.commands.help_text import help_text
+from vpd_lightning.config.paths import config_folder
 from vpd_lightning.errors import ConfigError
 
 # Hydra answers these itself; nothing is run.
@@ -23,13 +26,14 @@ _UNSUPPORTED = {
 
 @dataclass(frozen=True)
 class Arguments:
-    """A command line, taken apart: ``overrides`` are the words with ``=``, ``flags`` the rest."""
+    """A command line, taken apart: ``overrides`` are the words with ``=``, ``why`` is a key to explain."""
 
     overrides: list[str]
     flags: list[str]
     config_dir: str | None
     is_multirun: bool
     is_question: bool
+    why: str | None = None
 
 
 def parse_arguments(argv: Sequence[str]) -> Arguments:
@@ -40,13 +44,18 @@ def parse_arguments(argv: Sequence[str]) -> Arguments:
     """
     overrides: list[str] = []
     flags: list[str] = []
-    config_dir, is_multirun, is_question = None, False, False
+    config_dir, is_multirun, is_question, why = None, False, False, None
     words = iter(argv)
     for word in words:
         name, _, value = word.partition("=")
         if not word.startswith("-"):
             # A bare word after a flag that takes a value, such as `--cfg job`, belongs to the flag.
             (flags if is_question and "=" not in word else overrides).append(word)
+            continue
+        if name == "--why":
+            is_question, why = True, value or next(words, None)
+            if not why:
+                raise ConfigError("--why needs a key: --why optimizer.lr")
             continue
         flags.append(word)
         if name in _UNSUPPORTED:
@@ -65,7 +74,7 @@ def parse_arguments(argv: Sequence[str]) -> Arguments:
             flags += [] if value else [*islice(words, 1)]
         elif name not in ("--resolve", "--run", "-r"):
             raise ConfigError(f"there is no flag {name}.\nSettings are written key=value; --help shows examples.")
-    return Arguments(overrides, flags, config_dir, is_multirun, is_question)
+    return Arguments(overrides, flags, config_dir, is_multirun, is_question, why)
 
 
 def configure(command: str, argv: Sequence[str]) -> dict[str, Any] | None:
@@ -90,45 +99,28 @@ def configure(command: str, argv: Sequence[str]) -> dict[str, Any] | None:
 
 
 def answer(command: str, argv: Sequence[str]) -> None:
-    """Let Hydra answer ``--help``, ``--cfg job``, ``--info`` and the like."""
+    """Answer ``--help``, ``--why`` and ``--version``, and let Hydra answer ``--cfg job``, ``--info`` and the like."""
     from vpd_lightning.config import compose
+    from vpd_lightning.config.composing import option_folders
 
     arguments = parse_arguments(argv)
+    if {"--help", "-h"} & set(arguments.flags):
+        folders = [config_folder(), *option_folders(arguments.config_dir, arguments.overrides)]
+        print(help_text(command, folders))
+        return
     if "--version" in arguments.flags:
         from vpd_lightning import __version__
 
         print(f"vpd-{command} {__version__}")
         return
+    if arguments.why is not None:
+        from vpd_lightning.config.why import explain_key
+
+        print(explain_key(command, arguments.why, arguments.overrides, arguments.config_dir))
+        return
     if any(flag in ("--cfg", "-c") for flag in (flag.partition("=")[0] for flag in arguments.flags)):
         compose(command, arguments.overrides, arguments.config_dir)  # a named error instead of Hydra's
-    with _options_copied_once():
-        run_hydra(command, argv, lambda config: None)
-
-
-@contextmanager
-def _options_copied_once() -> Iterator[None]:
-    """Let Hydra list options quickly: for each group of a help text it copies all that it knows, in two seconds.
-
-    What is copied is only read while nothing is overridden, so that one copy will do.
-    """
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
-
-    name = "_parse_overrides_and_create_caching_repo"
-    original = getattr(ConfigLoaderImpl, name)
-    kept: dict[Any, Any] = {}
-
-    def copy_once(loader: Any, config_name: Any, overrides: Any) -> Any:
-        if config_name is not None or overrides:
-            return original(loader, config_name, overrides)
-        if loader not in kept:
-            kept[loader] = original(loader, config_name, overrides)
-        return kept[loader]
-
-    setattr(ConfigLoaderImpl, name, copy_once)
-    try:
-        yield
-    finally:
-        setattr(ConfigLoaderImpl, name, original)
+    run_hydra(command, argv, lambda config: None)
 
 
 def run_hydra(command: str, argv: Sequence[str], task: Callable[[Any], Any]) -> None:
@@ -138,9 +130,9 @@ def run_hydra(command: str, argv: Sequence[str], task: Callable[[Any], Any]) -> 
     from vpd_lightning.config import config_folder
     from vpd_lightning.config.composing import plugin_search_path, prepare
 
-    prepare()
     # Hydra's parser takes settings in one run of words only, and plug-ins add one: flags go in front.
     arguments = parse_arguments(argv)
+    prepare(arguments.config_dir, arguments.overrides)
     words = [*arguments.flags, *arguments.overrides, *plugin_search_path(arguments.overrides)]
     with _command_line(f"vpd-{command}", words):
         try:
@@ -148,6 +140,35 @@ def run_hydra(command: str, argv: Sequence[str], task: Callable[[Any], Any]) -> 
         except SystemExit as stop:
             if stop.code not in (None, 0):
                 raise
+
+
+def run_composed(command: str, argv: Sequence[str], config: Any, task: Callable[[Any], Any]) -> None:
+    """Make the run folder, set up the log, and call ``task``: as ``run_hydra``, for one run that is composed already.
+
+    Args:
+        command: name of the root configuration.
+        argv: the words that the configuration comes from.
+        config: the configuration with Hydra's own section, as Hydra composes it.
+        task: gets the configuration without that section.
+    """
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.core.utils import configure_log
+    from omegaconf import OmegaConf, open_dict, read_write
+
+    arguments = parse_arguments(argv)
+    folder = Path(str(OmegaConf.select(config, "hydra.run.dir"))).absolute()
+    with read_write(config), open_dict(config):
+        config.hydra.runtime.output_dir = str(folder)
+    before = HydraConfig.instance().cfg
+    # Lightning looks here when it starts a process for each further device.
+    HydraConfig.instance().set_config(config)
+    try:
+        with _command_line(f"vpd-{command}", [*arguments.flags, *arguments.overrides]):
+            folder.mkdir(parents=True, exist_ok=True)
+            configure_log(config.hydra.job_logging, config.hydra.verbose)
+            task(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
+    finally:
+        HydraConfig.instance().cfg = before
 
 
 @contextmanager

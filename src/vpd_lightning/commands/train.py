@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from vpd_lightning.commands.hydra_application import Arguments, answer, parse_arguments, run_hydra
+from vpd_lightning.commands.hydra_application import Arguments, answer, parse_arguments, run_composed, run_hydra
 from vpd_lightning.commands.report_errors import format_error, run_command
 from vpd_lightning.errors import ConfigError, VPDError
 
@@ -64,10 +64,10 @@ def _train_as_told(arguments: Arguments) -> int:
 
     overrides = resumed_overrides(arguments.overrides)
     jobs = expand_sweep("train", overrides, arguments.config_dir) if arguments.is_multirun else [overrides]
-    pairs = [compose_with_folder(words, arguments.config_dir, _NOT_CHOSEN) for words in jobs]
-    configs = [config for config, _ in pairs]
+    composed = [compose_with_folder(words, arguments.config_dir, _NOT_CHOSEN) for words in jobs]
+    configs = [config for config, _, _ in composed]
     _check_places(configs, overrides, arguments)
-    for _, placed in pairs:
+    for _, placed, _ in composed:
         _check_sections(placed)
     if wants_auto(arguments.overrides):
         _make_room(configs[0])
@@ -86,7 +86,10 @@ def _train_as_told(arguments: Arguments) -> int:
             if arguments.is_multirun:
                 _show(error)
 
-    run_hydra("train", [*arguments.flags, *overrides], job)
+    if arguments.is_multirun:
+        run_hydra("train", [*arguments.flags, *overrides], job)
+    else:
+        run_composed("train", [*arguments.flags, *overrides], composed[0][2], job)
     if not failures:
         return 0
     if arguments.is_multirun:

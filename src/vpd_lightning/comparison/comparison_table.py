@@ -17,9 +17,8 @@ from vpd_lightning.comparison.settings import (
 )
 from vpd_lightning.metrics.metric_info import MetricInfo
 from vpd_lightning.metrics.registry import compared, metric
+from vpd_lightning.release.system_notes import COLORS
 
-# The order of the paper's table; others follow by name.
-SYSTEMS = ("slotformer", "savi", "global", "sequential", "vpd", "inertial", "persistence")
 EXPERIMENTS = (
     "mujoco_block", "deformable_block", "deformable_multi", "deformable_collision", "movi_a", "movi_b", "movi_c",
     "movi_a_high", "movi_c_high",
@@ -202,8 +201,8 @@ def _weight(
 
 
 def system_order(name: str) -> tuple[int, str]:
-    """The place of a system in tables, as a key to sort by."""
-    return _rank(SYSTEMS, name)
+    """The place of a system in tables, as a key to sort by: that of the paper's table; others follow by name."""
+    return _rank(tuple(COLORS), name)
 
 
 def _rank(order: Sequence[str], name: str) -> tuple[int, str]:

@@ -16,11 +16,8 @@ from vpd_lightning.comparison.tables import TITLES
 from vpd_lightning.files import AtomicPath
 from vpd_lightning.metrics.metric_info import MetricInfo
 from vpd_lightning.metrics.registry import HEADLINE, REFERENCES, image_metrics, metric, scores
+from vpd_lightning.release.system_notes import COLORS
 
-_COLORS = {
-    "vpd": "#0072b2", "slotformer": "#d55e00", "global": "#009e73", "sequential": "#cc79a7", "inertial": "#8c6d1f",
-    "persistence": "#56b4e9", "savi": "#e6ab02",
-}  # fmt: skip
 _SPARE = ("#7f3c8d", "#a6761d", "#e31a1c", "#33a02c", "#1b1b6f", "#b15928")
 _REFERENCE_STYLES: dict[str, dict[str, Any]] = {
     "copy_last": {"color": "#555555", "linestyle": "--", "linewidth": 1.2},
@@ -41,7 +38,7 @@ def rollout_plot(path: Path, table: ComparisonTable) -> bool:
 def settings_plot(path: Path, table: ComparisonTable, system: str) -> bool:
     """Draw the scores of every setting of one system over the predicted step."""
     rows = [row for row in table.rows if row.system == system]
-    colors = [*_COLORS.values(), *_SPARE]
+    colors = [*COLORS.values(), *_SPARE]
     named = [(row, row.name, colors[i % len(colors)]) for i, row in enumerate(rows)]
     infos = [info for info in image_metrics() if any(row.per_step(info.name) for row in rows)]
     return _curves(path, table, infos, named)
@@ -171,7 +168,7 @@ def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
 
 
 def _color(system: str, number: int) -> str:
-    return _COLORS.get(system) or _spare(number)
+    return COLORS.get(system) or _spare(number)
 
 
 def _spare(number: int) -> str:

@@ -11,7 +11,7 @@ from vpd_lightning.errors import VPDError
 
 # Settings that change what a run says, keeps or costs, but not what it learns; and those with columns of their own.
 _NOT_COMPARED = (
-    "experiment", "system", "seed", "sweep_name", "evaluate", "run", "resume", "debug", "force", "num_threads",
+    "experiment", "system", "size", "seed", "sweep_name", "evaluate", "run", "resume", "debug", "force", "num_threads",
     "logger", "protocol", "generate", "pretraining.ckpt", "data.folder", "data.num_workers", "data.cache",
     "data.num_validation_clips", "data.num_validation_steps", "data.validation_views", "trainer.default_root_dir",
     "trainer.log_every_n_steps", "trainer.enable_progress_bar", "trainer.enable_model_summary",

@@ -51,7 +51,7 @@ def _build(
 ) -> Any:
     refuse_references(section, name)
     _check_targets(section, name, more, packages)
-    target = _resolve(section["_target_"], name, packages)
+    target = resolve_class(section["_target_"], name, packages)
     if expected is not None and not issubclass(target, expected):
         raise ConfigError(f"{name}._target_ is {section['_target_']}.\nIt must be a kind of {expected.__name__}.")
     try:
@@ -103,7 +103,9 @@ def is_of_stages(config: Mapping[str, Any]) -> bool:
     if "_target_" not in section:
         raise ConfigError("model names no class.\nIts section needs a key _target_.")
     module, base = WHOLE_SYSTEM
-    return issubclass(_resolve(section["_target_"], "model", SYSTEM_PACKAGES), getattr(import_module(module), base))
+    return issubclass(
+        resolve_class(section["_target_"], "model", SYSTEM_PACKAGES), getattr(import_module(module), base)
+    )
 
 
 def check_widths(config: Mapping[str, Any]) -> None:
@@ -146,7 +148,7 @@ def check_targets(node: Any, name: str, given: Mapping[str, Any] | None = None) 
 def _check_targets(node: Any, name: str, given: Mapping[str, Any], packages: Sequence[str]) -> None:
     if isinstance(node, Mapping):
         if "_target_" in node:
-            _check_arguments(_resolve(node["_target_"], name, packages), node, name, given)
+            _check_arguments(resolve_class(node["_target_"], name, packages), node, name, given)
         for key, value in node.items():
             _check_targets(value, f"{name}.{key}", {}, packages)
     elif isinstance(node, Sequence) and not isinstance(node, str):
@@ -177,7 +179,7 @@ def refuse_references(node: Any, name: str) -> None:
 def _check_kind(section: Mapping[str, Any], name: str, module: str, base: str) -> None:
     if "_target_" not in section:
         raise ConfigError(f"{name} names no class.\nIts section needs a key _target_.")
-    target = _resolve(section["_target_"], name, SYSTEM_PACKAGES)
+    target = resolve_class(section["_target_"], name, SYSTEM_PACKAGES)
     if not issubclass(target, getattr(import_module(module), base)):
         raise ConfigError(f"{name}._target_ is {section['_target_']}.\nIt must be a kind of {base}.")
 
@@ -186,7 +188,7 @@ def _is_below(path: str, packages: Sequence[str]) -> bool:
     return any(path.startswith(f"{package}.") for package in packages)
 
 
-def _resolve(target: Any, name: str, packages: Sequence[str]) -> type:
+def resolve_class(target: Any, name: str, packages: Sequence[str]) -> type:
     """Return the class behind a dotted path; its own module must be allowed too, not only the path that leads there."""
     allowed = (*packages, *load_plugins().packages)
     refusal = ConfigError(

@@ -1,6 +1,8 @@
 """From command-line words to one checked, plain configuration."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +16,12 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from vpd_lightning.config.building import STAGES
+from vpd_lightning.config.effects import refuse_idle_words
 from vpd_lightning.config.explaining import explain, explain_missing_value, refuse_bypasses
 from vpd_lightning.config.paths import config_folder
 from vpd_lightning.config.plugins import load_plugins
-from vpd_lightning.config.run_folders import register_resolvers
+from vpd_lightning.config.resolvers import register_resolvers
 from vpd_lightning.config.schema import (
     BenchConfig,
     EvalConfig,
@@ -30,6 +34,8 @@ from vpd_lightning.config.schema import (
 )
 from vpd_lightning.errors import ConfigError
 
+_FORMER_GROUPS = ("stages", "tuning", "per_scene", "spacing")
+_ABOVE_THE_RECIPE = ("model", "experiment", "budget")
 SCHEMAS: dict[str, type] = {
     "train": TrainConfig,
     "eval": EvalConfig,
@@ -40,10 +46,13 @@ SCHEMAS: dict[str, type] = {
 }
 
 
-def prepare() -> None:
-    """Load plug-ins, register the schemas and the resolvers; safe to call again."""
-    load_plugins()
-    register_resolvers()
+def prepare(config_dir: str | Path | None = None, overrides: Sequence[str] = ()) -> None:
+    """Load plug-ins, register the schemas and the resolvers; safe to call again.
+
+    Raises:
+        ConfigError: see ``option_folders``.
+    """
+    register_resolvers([config_folder(), *option_folders(config_dir, overrides)])
     for command, schema in SCHEMAS.items():
         ConfigStore.instance().store(name=f"{command}_schema", node=schema)
 
@@ -59,13 +68,13 @@ def compose(command: str, overrides: Sequence[str], config_dir: str | Path | Non
     Raises:
         ConfigError: an unknown key, option or type, a value out of range, or a bypass of the schema.
     """
-    return _composed(command, overrides, config_dir)[1]
+    return _composed(command, overrides, config_dir)[2]
 
 
 def compose_with_folder(
     overrides: Sequence[str], config_dir: str | Path | None, folder: str
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the configuration of ``vpd-train`` as ``compose`` does, and as it is once it has a run folder.
+) -> tuple[dict[str, Any], dict[str, Any], Any]:
+    """Return the configuration of ``vpd-train`` as ``compose`` does, as it is once it has a run folder, and for Hydra.
 
     Composing takes most of the time until a training starts, and the two differ in what refers to the folder alone.
 
@@ -77,27 +86,42 @@ def compose_with_folder(
     Raises:
         ConfigError: see ``compose``.
     """
-    config, result = _composed("train", overrides, config_dir)
+    whole, config, result = _composed("train", overrides, config_dir)
     if result["run"]["folder"]:
-        return result, result
+        return result, result, whole
     config.run.folder = folder
-    return result, plain(config)
+    return result, plain(config), whole
 
 
-def _composed(command: str, overrides: Sequence[str], config_dir: str | Path | None) -> tuple[Any, dict[str, Any]]:
-    """Return the configuration as Hydra made it, and the plain and checked one."""
-    prepare()
-    refuse_bypasses(overrides)
-    config = _compose(command, overrides, config_dir)
+def _composed(command: str, overrides: Sequence[str], config_dir: str | Path | None) -> tuple[Any, Any, dict[str, Any]]:
+    """Return the configuration as Hydra made it, with its own section and without, and the plain and checked one."""
+    whole = compose_unresolved(command, overrides, config_dir, with_hydra=True)
+    config = OmegaConf.masked_copy(whole, [key for key in whole if key != "hydra"])
     schema = SCHEMAS.get(command)
     if schema is not None:
         _check_again(schema, config)
     result = plain(config)
-    if "scene" in result:
-        check_scene(result["scene"])
     if command == "train":
+        check_scene(result["scene"])
         check_training(result)
-    return config, result
+        if result["resume"] is None:  # words of an older run stay as they are
+            refuse_idle_words(config, result, overrides, [config_folder(), *option_folders(config_dir, overrides)])
+    return whole, config, result
+
+
+def compose_unresolved(
+    command: str, overrides: Sequence[str], config_dir: str | Path | None = None, *, with_hydra: bool = False
+) -> Any:
+    """Return the configuration as Hydra made it, with its references.
+
+    Raises:
+        ConfigError: an unknown key, option or type, or a bypass of the schema.
+    """
+    prepare(config_dir, overrides)
+    refuse_bypasses(overrides)
+    if command == "train":
+        _refuse_stage_settings(overrides, option_folders(config_dir, overrides))
+    return _compose(command, overrides, config_dir, with_hydra=with_hydra)
 
 
 def plain(config: Any) -> dict[str, Any]:
@@ -138,7 +162,7 @@ def sweep_parameters(command: str, overrides: Sequence[str], config_dir: str | P
     Raises:
         ConfigError: the words that are the same for all jobs cannot be composed.
     """
-    prepare()
+    prepare(config_dir, overrides)
     parser = OverridesParser.create()
     fixed = [word for word in overrides if not parser.parse_override(word).is_sweep_override()]
     config = _compose(command, fixed, config_dir, with_hydra=True)
@@ -146,30 +170,67 @@ def sweep_parameters(command: str, overrides: Sequence[str], config_dir: str | P
 
 
 def _compose(command: str, overrides: Sequence[str], config_dir: str | Path | None, *, with_hydra: bool = False) -> Any:
-    """Compose with Hydra; leaves a Hydra that is already running (a job of its own) as it was."""
-    folders = [str(folder) for folder in load_plugins().config_folders]
-    if config_dir is not None:
-        if not Path(config_dir).is_dir():
-            raise ConfigError(f"the configuration folder {config_dir} does not exist.\nIt was given by --config-dir.")
-        folders.insert(0, str(Path(config_dir).resolve()))
-    words = [*overrides, *_search_path(folders, overrides)]
+    try:
+        with initialized(overrides, config_dir) as words:
+            return hydra_compose(command, words, return_hydra_config=with_hydra)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        raise explain(error, command, overrides, lambda fewer: _compose(command, fewer, config_dir)) from error
+
+
+@contextmanager
+def initialized(overrides: Sequence[str], config_dir: str | Path | None) -> Iterator[list[str]]:
+    """Initialize Hydra and yield the words for it; leaves a Hydra that is already running (a job of its own) alone."""
+    words = [*overrides, *_search_path(option_folders(config_dir), overrides)]
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(config_folder()), version_base="1.3"):
-            return hydra_compose(command, words, return_hydra_config=with_hydra)
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
-        raise explain(error, command, overrides, lambda fewer: _compose(command, fewer, config_dir)) from error
+            yield words
     finally:
         GlobalHydra.instance().hydra = running
 
 
+def option_folders(config_dir: str | Path | None, overrides: Sequence[str] = ()) -> list[Path]:
+    """Return the folders of options that are not ours: of ``--config-dir``, of plug-ins, of ``hydra.searchpath``.
+
+    Raises:
+        ConfigError: the folder does not exist, or holds a group that is no more.
+    """
+    folders = list(load_plugins().config_folders)
+    if config_dir is not None:
+        if not Path(config_dir).is_dir():
+            raise ConfigError(f"the configuration folder {config_dir} does not exist.\nIt was given by --config-dir.")
+        folders.insert(0, Path(config_dir).resolve())
+    searched = (word for word in overrides if word.startswith("hydra.searchpath="))
+    folders += [Path(folder) for word in searched for folder in re.findall(r"file://([^'\",\]]+)", word)]
+    for folder in folders:
+        gone = next((group for group in _FORMER_GROUPS if (folder / group).is_dir()), None)
+        if gone is not None:
+            raise ConfigError(
+                f"{folder / gone} would have no effect: there is no group {gone} any more.\n"
+                "What a model is made of at a size, and how that is trained, stands in recipe/SIZE/MODEL.yaml."
+            )
+    return folders
+
+
 def plugin_search_path(overrides: Sequence[str]) -> list[str]:
     """Return the word that shows Hydra the configuration folders of plug-ins, or nothing where there are none."""
-    return _search_path([str(folder) for folder in load_plugins().config_folders], overrides)
+    return _search_path(load_plugins().config_folders, overrides)
 
 
-def _search_path(folders: Sequence[str], overrides: Sequence[str]) -> list[str]:
+def _refuse_stage_settings(overrides: Sequence[str], folders: Sequence[Path]) -> None:
+    """Refuse files of others that set what the recipe below them overwrites: settings of a stage."""
+    for group, _, option in (word.partition("=") for word in overrides):
+        for path in (folder / group / f"{option}.yaml" for folder in folders if group in _ABOVE_THE_RECIPE):
+            stage = next((name for name in STAGES if path.is_file() and name in OmegaConf.load(path)), None)
+            if stage is not None:
+                raise ConfigError(
+                    f"{path} sets values of {stage}, which the recipe of the model at its size would overwrite.\n"
+                    f"Make them an option, {stage}/mine.yaml, and choose it there: override /{stage}: mine"
+                )
+
+
+def _search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
     if not folders or any(word.startswith("hydra.searchpath=") for word in overrides):
         return []  # the user's own list wins
     return ["hydra.searchpath=[" + ",".join(f"'file://{folder}'" for folder in folders) + "]"]

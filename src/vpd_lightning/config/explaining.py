@@ -127,6 +127,11 @@ def _explain_unknown_key(
     return ConfigError(f"there is no key {key}.\n{guess or 'All keys: --cfg job.'}")
 
 
+def unknown_key(key: str, config: Any) -> ConfigError:
+    """Return the error for a key that a composed configuration does not have."""
+    return ConfigError(f"there is no key {key}.\n{_nearest_key(key, list(keys_of(config))) or 'All keys: --cfg job.'}")
+
+
 def _nearest_key(key: str, known: Sequence[str]) -> str:
     """Suggest, in this order: the section spelt right, a near neighbour, the same word in another section, any key."""
     section, _, leaf = key.rpartition(".")

@@ -11,19 +11,12 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
-from omegaconf import OmegaConf
-
 # Rank 0 tells the processes it starts where the run lies.
 ENVIRONMENT = "VPD_RUN_FOLDER"
 # What a job's place says already, or what does not change what comes out.
 _UNNAMED = ("sweep", "sweep_name", "experiment", "resume", "evaluate", "num_threads", "debug")
 _UNNAMED_SECTIONS = ("run.", "hydra.", "hydra/")
 _MAX_SLUG = 100
-
-
-def register_resolvers() -> None:
-    """Make ``${vpd_run_folder:...}`` known to OmegaConf."""
-    OmegaConf.register_new_resolver("vpd_run_folder", choose_run_folder, replace=True)
 
 
 def choose_run_folder(folder: str | None, root: str, experiment: str, overrides: Sequence[str]) -> str:

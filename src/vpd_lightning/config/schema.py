@@ -76,6 +76,7 @@ class TrainConfig:
 
     experiment: str = MISSING
     system: str = MISSING
+    size: str = MISSING
     evaluate: bool = MISSING
     sweep_name: str | None = None
     pretraining: PretrainingConfig | None = None
@@ -130,36 +131,44 @@ class DataChoice:
 
 
 @dataclass
-class EvalConfig:
-    """Root of ``vpd-eval``."""
+class TrainedModelConfig:
+    """What the roots below ask for alike: a trained model, its data, and where it runs."""
 
     ckpt: str = MISSING
     change: Any = None
     sleeping: bool = MISSING
-    hide_depth: bool = MISSING
     data: DataChoice = MISSING
-    force: bool = MISSING
-    out: str | None = None
     device: str = MISSING
-    num_videos: int = MISSING
     num_threads: int | None = None
     debug: bool = MISSING
+
+
+@dataclass
+class EvalConfig(TrainedModelConfig):
+    """Root of ``vpd-eval``."""
+
+    hide_depth: bool = MISSING
+    force: bool = MISSING
+    out: str | None = None
+    num_videos: int = MISSING
     protocol: ProtocolConfig = MISSING
 
 
 @dataclass
-class RenderConfig:
-    """Root of ``vpd-render``."""
+class RecordingConfig(TrainedModelConfig):
+    """Which moment of which recording a model starts from, and for how long."""
 
-    ckpt: str = MISSING
-    change: Any = None
-    sleeping: bool = MISSING
-    data: DataChoice = MISSING
     split: str = MISSING
     trajectory: int = MISSING
     start_frame: int = MISSING
-    edit: str | None = None
     num_steps: int = MISSING
+
+
+@dataclass
+class RenderConfig(RecordingConfig):
+    """Root of ``vpd-render``."""
+
+    edit: str | None = None
     freeze_step: int | None = None
     camera: Any = MISSING
     num_views: int | None = None
@@ -170,27 +179,13 @@ class RenderConfig:
     save_particles: list[str] = MISSING
     save_maps: list[str] = MISSING
     save_camera_path: bool = MISSING
-    device: str = MISSING
-    num_threads: int | None = None
-    debug: bool = MISSING
 
 
 @dataclass
-class ViewConfig:
+class ViewConfig(RecordingConfig):
     """Root of ``vpd-view``."""
 
-    ckpt: str = MISSING
-    change: Any = None
-    sleeping: bool = MISSING
-    data: DataChoice = MISSING
-    split: str = MISSING
-    trajectory: int = MISSING
-    start_frame: int = MISSING
-    num_steps: int = MISSING
     port: int = MISSING
-    device: str = MISSING
-    num_threads: int | None = None
-    debug: bool = MISSING
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """The data of systems that know single camera views only: clips of them, and the slots they are stored as."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,19 @@ class ViewDataModule(VideoDataModule):
         self.use_slots, self.slot_folder = use_slots, slot_folder
         self.cache_images = bool(video["cache"])
         self.slots: SlotStore | None = None
+
+    @staticmethod
+    def settings_without_effect(settings: Mapping[str, Any]) -> dict[str, str]:
+        """Return the arguments that change nothing beside the others, each with the reason."""
+        of_scenes = (
+            "rays_per_step", "input_views", "moving_ray_fraction", "moving_ray_margin", "moving_color_threshold",
+            "moving_depth_threshold", "load_future",
+        )  # fmt: skip
+        idle = dict.fromkeys(of_scenes, "systems of single camera views see whole images, no rays and no depth")
+        if not settings["use_slots"]:
+            reason = "data.use_slots=false: clips have the frames of the history only"
+            idle |= dict.fromkeys(("num_steps", "num_steps_schedule", "slot_folder"), reason)
+        return idle
 
     def _context_views(self) -> list[int]:
         return self._views(self.validation_views)
