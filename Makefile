@@ -1,4 +1,5 @@
-# Everything one does with this project; `make help` lists it. Two commands for a newcomer: `make setup`, `make demo`.
+# Everything one does with this project; `make help` lists it. Two commands for a newcomer: `make demo` and `make test`;
+# each sets up what it needs.
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
@@ -12,6 +13,8 @@ BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 # Test processes. Each computes on one thread, so that they share the cores instead of fighting over them.
 WORKERS ?= 2
+# More words for pytest: make test PYTEST_ARGS="--cpu-seconds seconds.json" writes where the processor seconds go.
+PYTEST_ARGS ?=
 SEED ?= 0
 DEMO_DATA ?= datasets/mujoco_block_demo
 DEMO_RUN ?= runs/demo/seed$(SEED)
@@ -19,11 +22,11 @@ STAMP := $(VENV)/.installed
 
 export MPLBACKEND = Agg
 
-.PHONY: view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-fast check format format-check lint \
+.PHONY: view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-parts test-data test-site test-package test-launchers test-browser test-fast check format format-check lint \
 	types imports docs cluster bench stability paper-step wheel clean
 
 help: ## List the targets
-	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-17s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	echo
 	echo "Variables: PYTHON=$(PYTHON) TORCH=$(TORCH) WORKERS=$(WORKERS) SEED=$(SEED)"
 
@@ -74,13 +77,37 @@ novel-view-figure: $(STAMP) ## Draw the paper's novel-view figure: a ring of cam
 	$(BIN)/vpd-data generate scene=deformable_collision preset=tiny out=$(EDIT_DATA) seed=0
 	$(BIN)/vpd-render ckpt=released/deformable_collision_inertial data.folder=$(EDIT_DATA) freeze_step=15 camera=ring num_views=8 out=$(call NEW_FOLDER,runs/novel_view_figure)
 
-test: $(STAMP) ## Run all tests, of the stability matrix a part that covers it (no GPU, no torch-cluster; about 25 minutes on two cores)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m "not exhaustive" --durations=15 --durations-min=5
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+PARALLEL = -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+# What has a target of its own: markers, and where the tests that have them lie.
+PARTS = data or site or package or launcher or browser
+PARTS_IN = tests/data_gen tests/integration tests/commands/test_launchers.py tests/viewer tests/test_site.py tests/test_packaging.py
 
-test-fast: $(STAMP) ## Run the tests that are not marked slow, without the stability matrix (under 2 minutes)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" --ignore=tests/stability
+test: $(STAMP) ## Run the tests, but for the parts below; of the stability matrix a part that covers it (no GPU, no torch-cluster)
+	$(PYTEST) $(PARALLEL) -m "not exhaustive and not ($(PARTS))" --durations=15 --durations-min=5 $(PYTEST_ARGS)
 
-check: format-check lint types imports test ## Everything that must pass before a change goes in
+test-parts: $(STAMP) ## Run the five parts below in one go
+	$(PYTEST) $(PARALLEL) $(PARTS_IN) -m "$(PARTS)" --durations=15 --durations-min=5 $(PYTEST_ARGS)
+
+test-data: $(STAMP) ## Test that data sets are generated and imported, and that each can be trained on (some need GL)
+	$(PYTEST) $(PARALLEL) tests/data_gen tests/integration -m data
+
+test-site: $(STAMP) ## Test the pages of docs/ as a site, built strictly
+	$(PYTEST) tests/test_site.py -m site
+
+test-package: $(STAMP) ## Test the wheel and a plug-in, installed
+	$(PYTEST) tests/test_packaging.py tests/integration -m package
+
+test-launchers: $(STAMP) ## Test Hydra's launchers, which start a process for each run
+	$(PYTEST) tests/commands/test_launchers.py -m launcher
+
+test-browser: $(STAMP) ## Test the viewer in Chromium
+	$(PYTEST) tests/viewer -m browser
+
+test-fast: $(STAMP) ## Run the tests that are not marked slow, without parts and stability matrix (under 2 minutes)
+	$(PYTEST) -n $(WORKERS) --dist loadfile -m "not slow and not ($(PARTS))" --ignore=tests/stability
+
+check: format-check lint types imports test test-parts ## Everything that must pass before a change goes in
 
 format: $(STAMP) ## Rewrite the code in the house format
 	$(BIN)/ruff format .
@@ -115,7 +142,7 @@ comma := ,
 empty :=
 
 stability: $(STAMP) ## Run the whole numerical stability matrix; the last line counts its cases
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/stability -n $(WORKERS) --dist loadfile -q
+	$(PYTEST) tests/stability -n $(WORKERS) --dist loadfile -q
 
 reliability: $(STAMP) ## Kill, damage, mutate, requeue: every promise of docs/reliability.md, in under 40 minutes; writes its table
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.reliability

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests import fork_server
 from tests.cpu_seconds import pytest_addoption, pytest_configure  # noqa: F401
 
 # Tests run in several processes; more threads than cores makes all of them slower. Set before OpenCV or HDF5 load.
@@ -42,6 +43,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put files with slow tests first, so that no process is left alone with a long one at the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
+
+
+def pytest_sessionfinish() -> None:
+    fork_server.stop()
 
 
 @pytest.fixture(autouse=True)

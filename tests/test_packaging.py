@@ -85,6 +85,7 @@ def test_everything_imported_is_required():
 
 
 @pytest.mark.slow
+@pytest.mark.package
 def test_wheel_holds_code_configuration_and_licence_but_no_tests(wheel: Path):
     names = zipfile.ZipFile(wheel).namelist()
 
@@ -98,6 +99,7 @@ def test_wheel_holds_code_configuration_and_licence_but_no_tests(wheel: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.package
 def test_installed_package_is_the_wheels(installed: Path, tmp_path: Path):
     result = run(installed / "python", "-c", "import vpd_lightning; print(vpd_lightning.__file__)", cwd=tmp_path)
 
@@ -105,6 +107,7 @@ def test_installed_package_is_the_wheels(installed: Path, tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.package
 @pytest.mark.parametrize("command", COMMANDS)
 def test_installed_command_shows_its_help_from_another_folder(installed: Path, command: str, tmp_path: Path):
     result = run(installed / command, "--help", cwd=tmp_path)
@@ -114,6 +117,7 @@ def test_installed_command_shows_its_help_from_another_folder(installed: Path, c
 
 
 @pytest.mark.slow
+@pytest.mark.package
 @pytest.mark.parametrize("experiment", ["tiny", "mujoco_block"])
 def test_installed_training_command_composes_an_experiment(installed: Path, experiment: str, tmp_path: Path):
     result = run(installed / "vpd-train", f"experiment={experiment}", "--cfg", "job", cwd=tmp_path)
@@ -123,6 +127,7 @@ def test_installed_training_command_composes_an_experiment(installed: Path, expe
 
 
 @pytest.mark.slow
+@pytest.mark.package
 def test_installed_generator_finds_its_presets(installed: Path, tmp_path: Path):
     result = run(
         installed / "vpd-data", "generate", "scene=mujoco_block", "preset=tiny", "out=data", "seed=0", cwd=tmp_path

@@ -71,6 +71,7 @@ def test_every_page_is_in_the_menu_once() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.site
 def test_site_builds_without_a_warning(site: Path) -> None:
     assert {page.with_suffix(".html").name for page in DOCS.glob("*.md")} <= {page.name for page in site.glob("*.html")}
     assert (site / "search" / "search_index.json").stat().st_size > 100_000
@@ -78,6 +79,7 @@ def test_site_builds_without_a_warning(site: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.site
 def test_no_page_loads_anything_from_another_host(site: Path) -> None:
     pages = list(site.rglob("*.html"))
     outside = {link for page in pages for link in Resources(page).found if urlsplit(link).scheme or link[:2] == "//"}
@@ -91,6 +93,7 @@ def test_no_page_loads_anything_from_another_host(site: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.site
 def test_everything_that_a_page_shows_is_there(site: Path) -> None:
     missing = []
     pictures = set()
@@ -107,6 +110,7 @@ def test_everything_that_a_page_shows_is_there(site: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.site
 def test_links_that_leave_the_pages_are_no_links_on_the_site(site: Path) -> None:
     guide = (site / "adding_a_component.html").read_text()
 
@@ -140,6 +144,7 @@ def test_link_to_a_file_that_is_not_there_is_refused() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.site
 @pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: page.relative_to(DOCS).as_posix())
 def test_page_has_the_same_parts_on_the_site_as_in_the_repository(site: Path, page: Path) -> None:
     """The site's Markdown is stricter: lists need a blank line before them, and four blanks inside them."""

@@ -21,6 +21,7 @@ def multirun(words: Sequence[str], folder: Path) -> tuple[int, str]:
 
 
 @pytest.mark.slow
+@pytest.mark.launcher
 def test_each_run_has_a_process_and_a_folder(quick: list[str], in_folder: Path):
     code, output = multirun([*quick, "seed=0,1"], in_folder)
 
@@ -29,6 +30,7 @@ def test_each_run_has_a_process_and_a_folder(quick: list[str], in_folder: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.launcher
 def test_a_run_that_fails_elsewhere_fails_here(quick: list[str], in_folder: Path):
     code, output = multirun([*quick, "data.num_steps=40"], in_folder)
 

@@ -7,10 +7,12 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
+from tests import fork_server
 from tests.waiting import HANG, wait_until
 from vpd_lightning.commands import train
 from vpd_lightning.training.checkpoint_files import load_checkpoint
@@ -18,10 +20,10 @@ from vpd_lightning.training.checkpoint_files import load_checkpoint
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def start(words: list[str], cwd: Path) -> subprocess.Popen:
+def start(words: list[str], cwd: Path, popen: Any = fork_server.popen) -> Any:
     """Start ``vpd-train`` as a process of its own."""
     environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
+    return popen(
         [sys.executable, "-m", "vpd_lightning.commands.train", *words],
         cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
@@ -217,7 +219,7 @@ def test_signal_saves_a_checkpoint_and_gives_the_shells_exit_code(
 @pytest.mark.slow
 @pytest.mark.ddp
 def test_two_processes_share_one_run_folder(quick: list[str], in_folder: Path):
-    process = start([*quick, "trainer=ddp_cpu"], in_folder)
+    process = start([*quick, "trainer=ddp_cpu"], in_folder, subprocess.Popen)
     out, err = process.communicate(timeout=HANG)
 
     assert process.returncode == 0, out + err

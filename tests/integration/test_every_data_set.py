@@ -57,6 +57,7 @@ def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.data
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_learns_from_its_data_set_and_is_evaluated(experiment: str, in_folder: Path):
     words = [f"experiment={experiment}", "budget=tiny", "run.folder=run", *QUICK]
@@ -69,6 +70,7 @@ def test_experiment_learns_from_its_data_set_and_is_evaluated(experiment: str, i
 
 
 @pytest.mark.slow
+@pytest.mark.data
 @pytest.mark.gl
 def test_training_makes_its_data_set_in_an_empty_folder(in_folder: Path, capsys: pytest.CaptureFixture[str]):
     words = ["experiment=deformable_collision", "budget=tiny", "run.folder=run", "num_threads=1"]

@@ -59,6 +59,7 @@ def run(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.package
 def test_package_is_chosen_without_a_change_of_ours(run: Path) -> None:
     section = yaml.safe_load((run / "config.yaml").read_text())["dynamics"]
 
@@ -67,6 +68,7 @@ def test_package_is_chosen_without_a_change_of_ours(run: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.package
 def test_its_checkpoint_loads_and_its_contract_is_kept(site: Path, run: Path, tmp_path: Path) -> None:
     code = (
         f"import sys, pytest, vpd_lightning; dynamics = vpd_lightning.load({str(run)!r}).dynamics; "

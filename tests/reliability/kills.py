@@ -58,12 +58,12 @@ def chain(data: Path, folder: Path, temporary: Path, seed: int, num_kills: int, 
 
 
 def _wait_for_a_step_perhaps(process: subprocess.Popen[str], draw: random.Random) -> None:
-    """Let a random time go by: one time in five since the start, else since the first step that it told of."""
-    if draw.random() > 0.2:
-        for line in process.stdout or ():
-            if line.startswith("step "):
-                break
-    time.sleep(draw.uniform(0.0, 1.5))
+    """Wait for a random step that it prints; one time in five for none. Then for a moment, to be anywhere in a step."""
+    steps = 0 if draw.random() < 0.2 else draw.randint(1, max(STEPS // 12, 1))
+    printed = (line for line in process.stdout or () if line.startswith("step "))
+    for _ in range(steps):
+        next(printed, None)
+    time.sleep(draw.uniform(0.0, 0.1))
 
 
 def _no_orphans(group: int) -> None:

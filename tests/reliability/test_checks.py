@@ -4,9 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.reliability import checkpoints, disks, fuzz, kills
+from tests import fork_server
+from tests.reliability import checkpoints, disks, fuzz, kills, trainings
 from tests.reliability.outcome import Outcome, read, write
 from tests.reliability.trainings import differences, kill_group, members, run, start
+
+
+@pytest.fixture(autouse=True)
+def _forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trainings, "popen", fork_server.popen)
 
 
 def assert_kept(outcomes: list[Outcome]) -> None:

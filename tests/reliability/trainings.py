@@ -14,6 +14,7 @@ from vpd_lightning.commands import data
 from vpd_lightning.training.checkpoint_files import load_checkpoint
 
 TIMED = "rays_per_second"
+popen: Any = subprocess.Popen  # the tests of these checks fork instead, which is quicker
 
 
 def make_data(folder: Path) -> Path:
@@ -45,7 +46,7 @@ def start(arguments: list[str], *prefix: str, **options: Any) -> subprocess.Pope
     module = prefix or ("vpd_lightning.commands.train",)
     command = [sys.executable, "-m", *module, *arguments]
     settings = {"env": environment(), "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen(command, start_new_session=True, **{**settings, **options})
+    return popen(command, start_new_session=True, **{**settings, **options})
 
 
 def run(arguments: list[str], **options: Any) -> str:

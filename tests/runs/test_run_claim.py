@@ -1,13 +1,14 @@
 """Who may write into a run folder."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import IO
 
 import pytest
 
+from tests import fork_server
+from tests.fork_server import PIPE
 from tests.waiting import HANG
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.runs import run_claim
@@ -22,9 +23,9 @@ CLAIM_AND_WAIT = (
 def test_folder_is_claimed_while_a_process_has_it_and_free_after_that_was_killed(tmp_path: Path):
     folder = tmp_path / "run"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    process = subprocess.Popen(
+    process = fork_server.popen(
         [sys.executable, "-c", CLAIM_AND_WAIT, str(folder)],
-        env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env=environment, stdin=PIPE, stdout=PIPE,
     )  # fmt: skip
     assert process.stdout is not None and process.stdout.readline() == "mine\n"
 

@@ -1,7 +1,6 @@
 """Named sweeps: what is done stays done, what was begun goes on, what failed is told."""
 
 import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests import fork_server
+from tests.fork_server import PIPE
 from tests.waiting import HANG, wait_until
 from vpd_lightning.commands import train
 from vpd_lightning.errors import DataError
@@ -73,9 +74,9 @@ def statuses(said: str) -> list[str]:
 
 @contextmanager
 def another_process_has(job: SweepJob) -> Iterator[None]:
-    process = subprocess.Popen(
+    process = fork_server.popen(
         [sys.executable, "-c", HOLD_A_LOCK, str(job.sweep_folder / ".jobs" / job.name)],
-        env=ENVIRONMENT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env=ENVIRONMENT, stdin=PIPE, stdout=PIPE,
     )  # fmt: skip
     assert process.stdout is not None and process.stdout.readline() == "True\n"
     try:
@@ -234,9 +235,9 @@ def test_killed_sweep_goes_on_where_it_stopped(
     first, second = sweep_jobs(words, options)
     put_checkpoint(first.folder)
     (first.folder / FINISHED).touch()
-    process = subprocess.Popen(
+    process = fork_server.popen(
         [sys.executable, "-m", "vpd_lightning.commands.train", "-m", *words, f"--config-dir={options}"],
-        env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=ENVIRONMENT, stdout=PIPE, stderr=PIPE,
     )  # fmt: skip
     wait_until((second.folder / "checkpoints" / LAST).is_file, process, pause=0.005)
     process.kill()

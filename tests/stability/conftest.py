@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.stability.backends import IS_INTERPRETED
 from tests.stability.covering import covering
 from tests.stability.hard_scenes import MODES, SCENES, HardScene, Mode
 
@@ -15,15 +14,15 @@ FOLDER = Path(__file__).parent
 
 @pytest.hookimpl(tryfirst=True)  # before -m looks at markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as exhaustive every case whose values meet, two by two, in other cases of the same test.
+    """Mark as exhaustive every case whose values meet, two by two, in other cases of the same file.
 
-    Triton's interpreter takes a hundred times as long as the compiled loops: there the test is one more factor, so that
-    each of them sees each scene once, in either precision.
+    The test is one more factor: each of them sees every value of each of its parameters, and every two values that
+    meet in the file meet in one of its tests.
     """
     cases_of: dict[str, list[pytest.Function]] = defaultdict(list)
     for item in items:
         if item.path.is_relative_to(FOLDER) and isinstance(item, pytest.Function) and hasattr(item, "callspec"):
-            cases_of[str(item.path) if IS_INTERPRETED else item.nodeid.partition("[")[0]].append(item)
+            cases_of[str(item.path)].append(item)
     for cases in cases_of.values():
         values = [{name: repr(value) for name, value in case.callspec.params.items()} for case in cases]
         chosen = covering([{**of_case, "test": case.originalname} for of_case, case in zip(values, cases, strict=True)])

@@ -4,7 +4,6 @@ import csv
 import os
 import shutil
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 import torch
 
 from data_gen.inspection.split import split_dataset
+from tests import fork_server
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import SignalAt, tiny_data, tiny_module, tiny_trainer
 from tests.waiting import HANG
@@ -41,7 +41,7 @@ def train_and_die(data: Path, run: Path, step: int, num_workers: int) -> int:
     command = [sys.executable, "-m", "tests.training.tiny_training", str(data), str(run), f"--steps={STEPS}"]
     command += [f"--workers={num_workers}", f"--kill-at={step}"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=HANG, check=False)
+    done = fork_server.run(command, env=environment, capture_output=True, timeout=HANG)
     assert "\x1b" not in done.stdout + done.stderr  # no terminal, no control characters
     return done.returncode
 

@@ -34,6 +34,7 @@ TIMEOUT = 1000 * HANG  # milliseconds
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.browser,
     pytest.mark.skipif(CHROMIUM is None, reason="needs chromium (apt-get install chromium)"),
 ]
 
