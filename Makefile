@@ -80,13 +80,13 @@ novel-view-figure: $(STAMP) ## Draw the paper's novel-view figure: a ring of cam
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL = -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 # What has a target of its own: markers, and where the tests that have them lie.
-PARTS = data or site or package or launcher or browser
-PARTS_IN = tests/data_gen tests/integration tests/commands/test_launchers.py tests/viewer tests/test_site.py tests/test_packaging.py
+PARTS = data or site or package or launcher or browser or documents
+PARTS_IN = tests/data_gen tests/integration tests/commands/test_launchers.py tests/viewer tests/test_site.py tests/test_packaging.py tests/documents
 
 test: $(STAMP) ## Run the tests, but for the parts below; of the stability matrix a part that covers it (no GPU, no torch-cluster)
 	$(PYTEST) $(PARALLEL) -m "not exhaustive and not ($(PARTS))" --durations=15 --durations-min=5 $(PYTEST_ARGS)
 
-test-parts: $(STAMP) ## Run the five parts below in one go
+test-parts: $(STAMP) ## Run the six parts below in one go
 	$(PYTEST) $(PARALLEL) $(PARTS_IN) -m "$(PARTS)" --durations=15 --durations-min=5 $(PYTEST_ARGS)
 
 test-data: $(STAMP) ## Test that data sets are generated and imported, and that each can be trained on (some need GL)
@@ -104,8 +104,14 @@ test-launchers: $(STAMP) ## Test Hydra's launchers, which start a process for ea
 test-browser: $(STAMP) ## Test the viewer in Chromium
 	$(PYTEST) tests/viewer -m browser
 
+test-documents: $(STAMP) ## Test the commands and the Python that README and docs print, shrunk
+	$(PYTEST) $(PARALLEL) tests/documents -m documents
+
 test-fast: $(STAMP) ## Run the tests that are not marked slow, without parts and stability matrix (under 2 minutes)
 	$(PYTEST) -n $(WORKERS) --dist loadfile -m "not slow and not ($(PARTS))" --ignore=tests/stability
+
+pages: $(STAMP) ## Write the figures of the result files into README, docs and the cards of released models
+	$(BIN)/python -m benchmarks.page
 
 check: format-check lint types imports test test-parts ## Everything that must pass before a change goes in
 

@@ -1,6 +1,7 @@
-"""docs/paper_map.md and docs/systems.md speak of files, functions, options and sizes that exist."""
+"""Files, modules, functions, options and sizes that the pages speak of exist."""
 
 import ast
+import importlib.util
 import re
 from functools import cache
 from pathlib import Path
@@ -75,3 +76,16 @@ def test_parameter_counts_are_those_of_the_models() -> None:
         with torch.device("meta"):  # sizes without numbers
             system = build_simulator(config)
         assert f"{sum(parameter.numel() for parameter in system.parameters()):,}" == printed, name
+
+
+@pytest.mark.parametrize("page", ["README.md", *sorted(path.name for path in (ROOT / "docs").glob("*.md"))])
+def test_modules_that_a_page_tells_to_run_are_there(page: str) -> None:
+    text = (ROOT / page if page == "README.md" else ROOT / "docs" / page).read_text()
+    modules = {name for name in re.findall(r"python -m ([\w.]+)", text) if name not in ("pytest", "venv")}
+    assert not [name for name in modules if importlib.util.find_spec(name) is None]
+
+
+def test_links_of_the_readme_lead_to_files() -> None:
+    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", (ROOT / "README.md").read_text())
+    assert len(links) > 30
+    assert not [link for link in links if "://" not in link and not (ROOT / link).exists()]
