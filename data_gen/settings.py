@@ -4,40 +4,18 @@ import difflib
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from data_gen.presets import preset_folder, preset_names, scene_names
 from vpd_lightning.errors import ConfigError
 
 _MAX_EXTENDS = 8
 SPLIT_CODES = {"train": 0, "validation": 1, "test": 2}  # what a split adds to a trajectory's seed
 
 Settings = TypeVar("Settings")
-
-
-def preset_folder() -> Path:
-    """Return ``conf/data_gen``: beside this package in a checkout, inside ``vpd_lightning`` in an installed wheel."""
-    import vpd_lightning
-
-    beside = Path(__file__).resolve().parent.parent / "conf" / "data_gen"
-    inside = [Path(folder) / "conf" / "data_gen" for folder in vpd_lightning.__path__]
-    for folder in (beside, *inside):
-        if folder.is_dir():
-            return folder
-    raise ConfigError(f"The presets are missing: neither {beside} nor {inside[0]} exists. Reinstall the package.")
-
-
-def scene_names() -> list[str]:
-    """Return the scenes that can be generated."""
-    return sorted(folder.name for folder in preset_folder().iterdir() if folder.is_dir())
-
-
-def preset_names(scene: str) -> list[str]:
-    """Return the presets of a scene."""
-    return sorted(path.stem for path in (preset_folder() / scene).glob("*.yaml"))
 
 
 def require_choice(what: str, value: str, choices: Sequence[str]) -> None:
@@ -56,7 +34,7 @@ def load_preset(scene: str, preset: str) -> tuple[str, DictConfig]:
     """Return a preset's family (the package in ``data_gen`` that makes it) and its values.
 
     ``extends: SCENE/PRESET`` in a preset names another whose values (and family) hold where it says nothing. Without
-    ``family`` a scene is its own.
+    ``family`` a scene is its own. ``about`` is for ``vpd-data --help`` and decides nothing.
     """
     require_choice("scene", scene, scene_names())
     require_choice("preset", preset, preset_names(scene))
@@ -72,6 +50,7 @@ def load_preset(scene: str, preset: str) -> tuple[str, DictConfig]:
         name = values.pop("extends", "")
     merged = OmegaConf.merge(*reversed(chain))
     assert isinstance(merged, DictConfig)
+    merged.pop("about", None)
     return merged.pop("family", scene), merged
 
 

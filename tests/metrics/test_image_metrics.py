@@ -5,8 +5,9 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from vpd_lightning.metrics.psnr import masked_psnr, mean_squared_error, psnr
+from vpd_lightning.metrics.psnr import PSNR_CAP, mean_squared_error, psnr, psnr_of_images, psnr_of_moving_pixels
 from vpd_lightning.metrics.ssim import ssim
+from vpd_lightning.metrics.true_images import TrueImages
 
 
 def image_pair(*shape: int, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor]:
@@ -108,21 +109,30 @@ def test_metrics_need_no_leading_axis() -> None:
     assert psnr(pred, target).shape == ssim(pred, target).shape == ()
 
 
-def test_masked_psnr_looks_at_the_mask_only() -> None:
-    pred, target = image_pair(2, 16, 16)
-    mask = torch.zeros(2, 16, 16, dtype=torch.bool)
-    mask[:, :4, :5] = True
+def test_psnr_of_moving_pixels_looks_at_them_only() -> None:
+    pred, target = image_pair(1, 2, 16, 16)
+    mask = torch.zeros(1, 2, 16, 16, dtype=torch.bool)
+    mask[..., :4, :5] = True
     spoiled = torch.where(mask.unsqueeze(-1), pred, 1.0 - pred)
-    expected = psnr(pred[:, :4, :5], target[:, :4, :5])
-    torch.testing.assert_close(masked_psnr(spoiled, target, mask, min_pixels=10), expected)
+    found = psnr_of_moving_pixels(spoiled, TrueImages(target, mask, min_moving_pixels=10))
+    torch.testing.assert_close(found["psnr_moving"], psnr(pred[..., :4, :5, :], target[..., :4, :5, :]))
 
 
-def test_masked_psnr_is_missing_where_too_few_pixels_move() -> None:
-    pred, target = image_pair(2, 16, 16)
-    mask = torch.zeros(2, 16, 16, dtype=torch.bool)
-    mask[0, 0, :9] = True
-    mask[1, 0, :10] = True
-    assert masked_psnr(pred, target, mask, min_pixels=10).isnan().tolist() == [True, False]
+def test_psnr_of_moving_pixels_is_missing_where_too_few_move() -> None:
+    pred, target = image_pair(1, 2, 16, 16)
+    mask = torch.zeros(1, 2, 16, 16, dtype=torch.bool)
+    mask[0, 0, 0, :9] = True
+    mask[0, 1, 0, :10] = True
+    found = psnr_of_moving_pixels(pred, TrueImages(target, mask, min_moving_pixels=10))
+    assert all(values.isnan().tolist() == [[True, False]] for values in found.values())
+
+
+def test_an_exact_image_counts_as_the_cap_and_one_prediction_stands_for_all_steps() -> None:
+    pred, target = image_pair(3, 2, 16, 16)
+    pred[0] = target[2]
+    found = psnr_of_images(pred[:1], TrueImages(target))
+    assert found["psnr"].shape == (3, 2) and found["psnr"][2].tolist() == [PSNR_CAP, PSNR_CAP]
+    torch.testing.assert_close(found["psnr"][:2], psnr(target[2].expand(2, -1, -1, -1, -1), target[:2]))
 
 
 def test_error_of_an_empty_mask_is_missing() -> None:

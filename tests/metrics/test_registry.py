@@ -1,6 +1,7 @@
 """The list of metrics: each line can be measured, and nothing else holds its name."""
 
 import ast
+import json
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ from vpd_lightning.metrics.metric_info import MetricInfo
 from vpd_lightning.metrics.registry import METRICS, metric
 
 SOURCE = Path(vpd_lightning.__file__).parent
+ROOT = Path(__file__).resolve().parents[2]
+PUBLISHED = sorted([*ROOT.glob("released/*/metrics.json"), *ROOT.glob("docs/results/demo_*.json")])
 # Files that need one of them for what it means, not to list, print or compare it.
 ON_PURPOSE = {
     "metrics/psnr.py": {"psnr", "psnr_moving"},  # the parts that its functions return
@@ -51,6 +54,17 @@ def test_the_smaller_the_distance_the_better() -> None:
     assert metric("psnr").distance(30.0) < metric("psnr").distance(20.0)
     assert metric("chamfer").distance(0.01) < metric("chamfer").distance(0.02)
     assert metric("sharpness").distance(1.0) < metric("sharpness").distance(0.5)
+
+
+@pytest.mark.parametrize("path", PUBLISHED, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_figures_that_were_published_before_are_found(path: Path) -> None:
+    metrics = json.loads(path.read_text())
+    wanted = [info for info in METRICS if info.name in ("psnr", "psnr_moving", "ssim", "chamfer", "centroid_error")]
+    for info in wanted:
+        found = info.summary(metrics)
+        assert found is not None and found["mean"] > 0 and len(found["per_step"]) == metrics["protocol"]["num_steps"]
+        references = [info.summary(metrics, source) for source in registry.REFERENCES]
+        assert all((reference is not None) == (info.subject == "image") for reference in references)
 
 
 def test_an_unknown_name_is_answered_with_the_known_ones() -> None:

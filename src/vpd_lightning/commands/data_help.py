@@ -1,15 +1,19 @@
 """What ``vpd-data --help`` prints."""
 
-HELP = """vpd-data: make, bring in, look at and check data sets of posed RGB-D video
+from data_gen.presets import scene_description, scene_names
+
+
+def scene_lines() -> str:
+    """What can be generated, one line each."""
+    lines = (f"{name:<37} {scene_description(name)}".rstrip() for name in scene_names())
+    return "\n                ".join(lines)
+
+
+HELP = f"""vpd-data: make, bring in, look at and check data sets of posed RGB-D video
 
   vpd-data generate scene=NAME preset=paper|tiny out=FOLDER [seed=0] [renderer=...] [workers=N] [SETTING=VALUE ...]
       Simulate and render. Resumes where it stopped; the same seed gives the same files, whatever the workers.
-      scene     mujoco_block                          a block with six colours tossed onto a floor (also preset=demo)
-                deformable_block                      a soft cube dropped onto a floor
-                deformable_multi                      a soft cube, cylinder, donut, icosahedron or duck
-                deformable_collision                  two soft bodies that collide
-                movi_a movi_b movi_c                  three rigid objects thrown; plain, eleven shapes, textured
-                movi_a_high movi_c_high               the same from higher cameras
+      scene     {scene_lines()}
       preset    paper: the paper's counts and sizes (half an hour to 90 minutes on two cores); tiny: seconds
       renderer  auto (EGL, then OSMesa), egl, osmesa, blender (docs/blender.md), raycast (mujoco_block without GL)
       workers   processes; all cores by default; never changes the data

@@ -40,17 +40,6 @@ def psnr(
     return psnr_of(mean_squared_error(pred, target))
 
 
-def masked_psnr(
-    pred: Float[Tensor, "*image height width 3"],
-    target: Float[Tensor, "*image height width 3"],
-    mask: Bool[Tensor, "*image height width"],
-    min_pixels: int,
-) -> Float[Tensor, "*image"]:
-    """PSNR in dB over the pixels of ``mask``; NaN for images with fewer than ``min_pixels`` of them."""
-    values = psnr_of(mean_squared_error(pred, target, mask))
-    return torch.where(mask.sum((-2, -1)) >= min_pixels, values, torch.full_like(values, torch.nan))
-
-
 def psnr_of_images(
     pred: Float[Tensor, "step_or_1 view height width 3"], truth: TrueImages
 ) -> dict[str, Float[Tensor, "step view"]]:
