@@ -32,7 +32,7 @@ BUSY = {
     "scene.r_s=0.3": ("dynamics=sleeping",),
     "scene.location_noise=0.1": ("model=sequential",),
     "scene={shadow_scales:[0.1,0.2]}": ("model=inertial",),
-    "scene.input_views=[0]": ("model=slotformer",),
+    "scene.input_views=[1]": ("model=slotformer",),
     "color_features=true": ("renderer=splat",),
     "feature_dim=8": ("model=global",),
     "data.num_steps=3": ("model=slotformer",),
@@ -54,6 +54,16 @@ def test_the_same_word_is_taken_where_something_reads_it(word: str) -> None:
     words = [*BUSY[word], *PLACED]
 
     assert compose("train", [word, *words]) != compose("train", words)
+
+
+def test_a_stage_of_a_model_without_stages_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"encoder has no effect here: this model has no such stage"):
+        compose("train", ["model=slotformer", "encoder=unet", *PLACED])
+
+
+def test_a_key_below_one_that_is_null_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"no key pretraining.ckpt here: pretraining is null"):
+        compose("train", ["model=vpd", "pretraining.ckpt=1", *PLACED])
 
 
 def test_the_error_names_options_that_would_read_the_key() -> None:

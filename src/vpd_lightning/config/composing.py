@@ -173,7 +173,7 @@ def _compose(command: str, overrides: Sequence[str], config_dir: str | Path | No
     try:
         with initialized(overrides, config_dir) as words:
             return hydra_compose(command, words, return_hydra_config=with_hydra)
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
+    except (HydraException, OmegaConfBaseException, ValueError, AssertionError, TypeError) as error:
         raise explain(error, command, overrides, lambda fewer: _compose(command, fewer, config_dir)) from error
 
 

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from vpd_lightning.config.building import ALLOWED_PACKAGES, resolve_class
+from vpd_lightning.config.explaining import parsed
 from vpd_lightning.errors import ConfigError
 
 # Values that other sections refer to: whoever does not refer to one cannot depend on it.
@@ -68,7 +68,7 @@ def refuse_idle_words(
 
 def _given_keys(overrides: Sequence[str]) -> Iterator[str]:
     """Yield the keys that words set; where a word sets a section, those in its value."""
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
+    for override in parsed(overrides):
         yield from _leaves(override.key_or_group, override.value())
 
 

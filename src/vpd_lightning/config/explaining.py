@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator, Sequence
 from difflib import SequenceMatcher, get_close_matches
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, MissingMandatoryValue, ValidationError
@@ -28,6 +30,15 @@ def refuse_bypasses(overrides: Sequence[str]) -> None:
             )
 
 
+def parsed(overrides: Sequence[str]) -> list[Override]:
+    """Return the words of a command line as Hydra reads them.
+
+    Raises:
+        OverrideParseException: a word cannot be read.
+    """
+    return OverridesParser.create().parse_overrides(list(overrides))
+
+
 def explain(
     error: Exception, command: str, overrides: Sequence[str], compose: Callable[[Sequence[str]], Any]
 ) -> ConfigError:
@@ -42,21 +53,23 @@ def explain(
             f"Write key=value or group=option, without spaces around '=', for example: vpd-{command} seed=1"
         )
     if isinstance(error, MissingConfigException):
-        return _explain_missing_option(text, overrides)
-    unknown = re.search(r"Could not override '([^']+)'", text)
+        return _explain_missing_option(error.missing_cfg_file, error.options, overrides)
+    unknown = re.search(r"Could not override '([^']+)'", text)  # the exception has no field for it
     if unknown is not None:
-        return _explain_unknown_key(unknown[1], str(cause), overrides, compose)
+        return _explain_unknown_key(unknown[1], cause, overrides, compose)
     if isinstance(cause, ValidationError):
         return _explain_wrong_type(cause)
     if "Config group override must be" in text:
         group = next((w for w in overrides if w.partition("=")[2] in ("", "null") or _is_number(w)), "a group")
         return ConfigError(f"'{group}' does not name an option.\nA group takes the name of one of its files.")
-    if "Ambiguous value" in text:
-        word = re.search(r"'([^']+)'", text)
+    several = next((word for word in parsed(overrides) if word.is_sweep_override()), None)
+    if several is not None:
         return ConfigError(
-            f"'{word[1] if word else ''}' has several values.\n"
+            f"'{several.input_line}' has several values.\n"
             "For a sweep add -m; for a list write key=[1,2] (quote it for the shell)."
         )
+    if isinstance(error, AssertionError | TypeError):  # what OmegaConf does with a key below null, or with a list
+        return _explain_unfit_word(overrides, compose)
     if isinstance(error, InterpolationKeyError | MissingMandatoryValue):
         return explain_missing_value(error)
     return ConfigError("the configuration cannot be composed.\n" + "\n".join(text.splitlines()[:3]))
@@ -88,19 +101,12 @@ def keys_of(config: Any, prefix: str = "") -> Iterator[str]:
             yield from keys_of(value, f"{prefix}{name}.")
 
 
-def _explain_missing_option(text: str, overrides: Sequence[str]) -> ConfigError:
-    wanted = re.search(r"Could not (?:find|load) '([^']+)'", text)
-    if wanted is None:
-        return ConfigError("\n".join(text.splitlines()[:3]))
-    group, _, option = wanted[1].rpartition("/")
-    options = []
-    if "Available options" in text:
-        listing = text.split("Available options", 1)[1].split("Config search path")[0]
-        options = [line.strip() for line in listing.splitlines()[1:] if line.strip()]
-    guess = suggest(option, options)
+def _explain_missing_option(path: str | None, options: Sequence[str] | None, overrides: Sequence[str]) -> ConfigError:
+    group, _, option = (path or "").rpartition("/")
+    guess = suggest(option, options or ())
     if not options:
         names = [word.partition("=")[0] for word in overrides]
-        return ConfigError(f"there is no configuration {wanted[1]}.\nGiven: {' '.join(names) or 'nothing'}.")
+        return ConfigError(f"there is no configuration {path}.\nGiven: {' '.join(names) or 'nothing'}.")
     if group == "hydra/launcher" and option.startswith("submitit"):
         return ConfigError(
             f"hydra/launcher={option} is not installed.\npip install 'vpd-lightning[slurm]'; see docs/clusters.md."
@@ -111,16 +117,20 @@ def _explain_missing_option(text: str, overrides: Sequence[str]) -> ConfigError:
 
 
 def _explain_unknown_key(
-    key: str, cause: str, overrides: Sequence[str], compose: Callable[[Sequence[str]], Any]
+    key: str, cause: BaseException, overrides: Sequence[str], compose: Callable[[Sequence[str]], Any]
 ) -> ConfigError:
-    inner = re.search(r"full_key: (\S+)", cause)
-    key = inner[1] if inner and inner[1] != key and inner[1].startswith(key) else key
+    inner = getattr(cause, "full_key", None) or ""
+    key = inner if inner.startswith(key) else key
     guess = ""
     try:
         others = [word for word in overrides if "." not in word.partition("=")[0] and not word.startswith(key)]
         if len(others) == len(overrides):  # an option's own fault: fewer words would end here again
-            return ConfigError(f"{cause.splitlines()[0]}\nThe options chosen do not fit together; leave one away.")
+            return ConfigError(f"{str(cause).splitlines()[0]}\nThe options chosen do not fit together; leave one away.")
         known = list(keys_of(compose(others)))
+        if key in known:  # a group that no line of this configuration names
+            return ConfigError(
+                f"{key} has no effect here: this model has no such stage.\nRemove it, or choose another."
+            )
         guess = _nearest_key(key, known)
     except ConfigError:
         pass  # something else is wrong too; the key alone says enough
@@ -130,6 +140,20 @@ def _explain_unknown_key(
 def unknown_key(key: str, config: Any) -> ConfigError:
     """Return the error for a key that a composed configuration does not have."""
     return ConfigError(f"there is no key {key}.\n{_nearest_key(key, list(keys_of(config))) or 'All keys: --cfg job.'}")
+
+
+def _explain_unfit_word(overrides: Sequence[str], compose: Callable[[Sequence[str]], Any]) -> ConfigError:
+    """Name the first word that sets a key below one that is null, or below or in place of a section."""
+    chosen = [word.input_line for word in parsed(overrides) if isinstance(word.value(), str)]
+    config = compose([word for word in chosen if word and "." not in word.partition("=")[0]])
+    for word in parsed(overrides):
+        key, value = word.key_or_group, word.value()
+        section = key.rpartition(".")[0]
+        if section and OmegaConf.select(config, section) is None:
+            return ConfigError(f"there is no key {key} here: {section} is null.\nChoose an option that fills it.")
+        if OmegaConf.is_dict(OmegaConf.select(config, key)) and not isinstance(value, str | dict):
+            return ConfigError(f"{key} is a section.\nSet one of its keys, {key}.KEY=VALUE, or {key}={{KEY: VALUE}}.")
+    return ConfigError("the words do not fit the configuration.\nAll keys and their values: --cfg job.")
 
 
 def _nearest_key(key: str, known: Sequence[str]) -> str:
@@ -149,9 +173,8 @@ def _nearest_key(key: str, known: Sequence[str]) -> str:
     return suggest(key, siblings) or suggest(key, known)
 
 
-def _explain_wrong_type(cause: Exception) -> ConfigError:
-    key = getattr(cause, "full_key", None) or re.search(r"full_key: (\S+)", str(cause))
-    name = key if isinstance(key, str) else key[1] if key else "a key"
+def _explain_wrong_type(cause: ValidationError) -> ConfigError:
+    name = cause.full_key or "a key"
     reason = str(cause).splitlines()[0].replace("Integer", "a whole number").replace("Float", "a number")
     return ConfigError(f"{name} has the wrong type.\n{reason.rstrip('.')}.")
 
