@@ -13,7 +13,7 @@ BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 # Test processes. Each computes on one thread, so that they share the cores instead of fighting over them.
 WORKERS ?= 2
-# More words for pytest: make test PYTEST_ARGS="--cpu-seconds seconds.json" writes where the processor seconds go.
+# More words for pytest: make test PYTEST_ARGS="--cpu-seconds=seconds.json" writes where the processor seconds go.
 PYTEST_ARGS ?=
 SEED ?= 0
 DEMO_DATA ?= datasets/mujoco_block_demo

@@ -1,4 +1,4 @@
-"""Where the processor seconds of the tests go: ``pytest --cpu-seconds FILE`` writes them by folder and by test.
+"""Where the processor seconds of the tests go: ``pytest --cpu-seconds=FILE`` writes them by folder and by test.
 
 Seconds of the processor, unlike those of the clock, do not depend on what else the machine does. Processes that a test
 starts count with it; what is made once for several tests counts with the first of them.

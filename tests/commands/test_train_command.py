@@ -188,19 +188,6 @@ def test_flags_may_stand_anywhere_among_the_settings(line: str, capsys: pytest.C
 
 
 @pytest.mark.slow
-def test_help_needs_no_torch(tmp_path: Path):  # tests/test_architecture.py looks at the time
-    code = (
-        "import sys; from vpd_lightning.commands import train; code = train.main(['--help']);"
-        "assert 'torch' not in sys.modules and 'lightning' not in sys.modules; sys.exit(code)"
-    )
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}"}
-
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
-
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_signal_saves_a_checkpoint_and_gives_the_shells_exit_code(
     quick: list[str], in_folder: Path, number: signal.Signals, code: int
