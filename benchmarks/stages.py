@@ -28,6 +28,8 @@ USED = (
     "dynamics/hierarchical_gnn_small", "renderer/point_nerf", "renderer/point_nerf_small", "renderer/surface",
     "renderer/splat", "model/vpd",
 )  # fmt: skip
+# ${vpd_lookup:${size},{small:0.25},0.1}: what holds at sizes without an entry comes last.
+_BY_SIZE = re.compile(r"^\$\{vpd_lookup:\$\{size\},\{.*\},(.*)\}$")
 _PREPARED: dict[str, dict[str, Any]] = {}  # sections read from a JSON file instead of YAML
 
 
@@ -104,14 +106,16 @@ def _read(name: str) -> dict[str, Any]:
 
 
 def _filled(value: Any, scene: Mapping[str, Any]) -> Any:
-    """Resolve ``${scene.KEY}``, and what stands at the root of conf/train.yaml."""
+    """Resolve ``${scene.KEY}``, what stands at the root of conf/train.yaml, and values by size, of which it is the full."""
     if isinstance(value, Mapping):
         return {key: _filled(item, scene) for key, item in value.items()}
     if isinstance(value, list):
         return [_filled(item, scene) for item in value]
+    if isinstance(value, str) and (by_size := _BY_SIZE.match(value)):
+        return json.loads(by_size.group(1))
     if isinstance(value, str) and value.startswith("${"):
         key = value[2:-1]
-        return ROOT[key] if key in ROOT else scene[key.removeprefix("scene.")]
+        return ROOT[key] if key in ROOT else _filled(scene[key.removeprefix("scene.")], scene)
     return value
 
 

@@ -186,8 +186,14 @@ def serve(channel: socket.socket) -> dict[str, Any] | None:
             message, descriptors, _, _ = socket.recv_fds(channel, _LARGEST, 4)
             if not message:
                 return None
+            begun, beginning = os.pipe()
             pid = os.fork()
             if pid == 0:
+                request = json.loads(message)
+                if request["new_session"]:
+                    os.setsid()
+                os.close(begun)
+                os.close(beginning)
                 channel.close()
                 for entry in [*children, *(status for _, status in children.values()), descriptors[3]]:
                     os.close(entry)
@@ -195,7 +201,10 @@ def serve(channel: socket.socket) -> dict[str, Any] | None:
                     os.dup2(descriptors[place], place)
                 for entry in set(descriptors[:3]) - {0, 1, 2}:
                     os.close(entry)
-                return json.loads(message)
+                return request
+            os.close(beginning)
+            os.read(begun, 1)  # until the child has its session: whoever gets its number may end the whole group
+            os.close(begun)
             for entry in descriptors[:3]:
                 os.close(entry)
             os.write(descriptors[3], f"{pid}\n".encode())
@@ -213,8 +222,6 @@ def _tell_end(descriptor: int, pid: int, status: int) -> None:
 
 def become(request: dict[str, Any]) -> None:
     """Be the process that was asked for."""
-    if request["new_session"]:
-        os.setsid()
     os.environ.clear()
     os.environ.update(request["env"])
     os.chdir(request["cwd"])

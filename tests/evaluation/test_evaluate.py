@@ -189,7 +189,7 @@ def test_moving_pixels_without_segmentation_come_from_colour(test_paths: list[Pa
 def test_recordings_without_ground_truth_are_judged_by_their_pixels(
     manifest: Manifest, protocol: Protocol, test_paths: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vpd_lightning.evaluation.protocol.has_state", lambda path: False)
+    monkeypatch.setattr("vpd_lightning.data.clip.has_state", lambda path: False)
     metrics = metrics_of(evaluate(Oracle(test_paths), manifest, protocol, [0]), protocol, {})
     assert metrics["motion"] is None and metrics["long_rollout"] is None
     assert metrics["psnr_moving"]["mean"] == PSNR_CAP

@@ -91,7 +91,8 @@ class _Composition:
 
     def choosers(self, group: str) -> list[Setting]:
         seen = {file.config_path: file for file in self.files}
-        first, later = [], []
+        first: list[Setting] = []
+        later: list[Setting] = []
         for file in seen.values():
             for is_override, name, option, line in file.choices():
                 if name == group:
@@ -117,13 +118,13 @@ class _File:
         file = next((folder / f"{path}.yaml" for folder in folders if (folder / f"{path}.yaml").is_file()), None)
         if file is None:
             command = path.removesuffix("_schema")
-            content = OmegaConf.to_container(OmegaConf.structured(SCHEMAS[command]), resolve=False)
-            return cls(path, f"schema of {command}", package, content, "")  # type: ignore[arg-type]
+            content: Any = OmegaConf.to_container(OmegaConf.structured(SCHEMAS[command]), resolve=False)
+            return cls(path, f"schema of {command}", package, content, "")
         text = file.read_text(encoding="utf-8")
         place = str(file.relative_to(config_folder().parent) if config_folder() in file.parents else file)
         content = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-        content.pop("defaults", None)  # type: ignore[union-attr, call-arg]
-        return cls(path, place, package, content, text)  # type: ignore[arg-type]
+        content.pop("defaults", None)
+        return cls(path, place, package, content, text)
 
     def settings(self, key: str) -> Iterator[Setting]:
         inside = _nested(self.package, self.content) if self.package else self.content

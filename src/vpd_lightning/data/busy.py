@@ -11,12 +11,14 @@ _NUMBERS = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY, errno.ETXTBSY)
 # HDF5 gives these no number of their own.
 _MARKED_OPEN, _OPEN_IN_HERE = "already open for write", "file locking flag values don't match"
 _MAX_NAMED = 3
+_OURSELVES = "this program itself"
 
 
 def busy_error(path: Path, error: BaseException) -> BrokenFileError | None:
     """Return the error that says who holds the file, or None where nobody does and ``error`` is about its bytes."""
     text = str(error)
-    writers = _programs(path, writing=True)
+    # Handles of our own are left out: HDF5 may keep one of a file that was closed.
+    writers = [name for name in _programs(path, writing=True) if name != _OURSELVES]
     is_marked = _MARKED_OPEN in text
     if not (writers or is_marked or _OPEN_IN_HERE in text or getattr(error, "errno", None) in _NUMBERS):
         return None
@@ -62,7 +64,7 @@ def _writes(facts: str) -> bool:
 
 def _name(process: int) -> str:
     if process == os.getpid():
-        return "this program itself"
+        return _OURSELVES
     try:
         return f"{Path(f'/proc/{process}/comm').read_text().strip()} (process {process})"
     except OSError:

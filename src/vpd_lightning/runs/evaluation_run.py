@@ -12,7 +12,6 @@ from vpd_lightning.data.trained_on import DATA_SHA256
 from vpd_lightning.errors import ConfigError, OutOfMemoryError
 from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.evaluation.seen import seen_in_training
-from vpd_lightning.evaluation.summary import summary_lines
 from vpd_lightning.files import OutputFolder, choose_folder
 from vpd_lightning.loading import LoadedModel, load_model
 from vpd_lightning.release.results_folder import beside_checkpoint
@@ -48,6 +47,8 @@ def run_evaluation(config: Mapping[str, Any]) -> Path:
     with OutputFolder(folder) as partial:
         metrics = _write_evaluation(partial, model, manifest, protocol, config, seen)
     path = folder / "metrics.json"
+    from vpd_lightning.evaluation.summary import summary_lines
+
     print("\n".join(summary_lines(metrics)))
     print()
     print(path)

@@ -1,7 +1,7 @@
 """What a tab of the viewer needs of the panel that it stands in."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import viser
 
@@ -11,6 +11,7 @@ from vpd_lightning.viewer.progressive_view import Viewpoint
 from vpd_lightning.viewer.session import Session
 
 
+@runtime_checkable
 class TabHost(Protocol):
     """One client's panel, as its tabs see it; ``Panel`` is the one there is."""
 
