@@ -18,10 +18,10 @@ from vpd_lightning.editing.edit_files import save_edit
 from vpd_lightning.editing.scene_editor import SceneEditor
 from vpd_lightning.editing.selectors import AnyOf, Cluster, Everything
 from vpd_lightning.errors import ConfigError
-from vpd_lightning.export.output_folder import OutputFolder
-from vpd_lightning.export.pictures import write_png
-from vpd_lightning.export.video import enlarge, framed, label_bar
+from vpd_lightning.files import OutputFolder
 from vpd_lightning.loading import load_model
+from vpd_lightning.media.pictures import write_png
+from vpd_lightning.media.video import enlarge, framed, label_bar
 from vpd_lightning.viewer.opened_scene import OpenedScene, open_scene
 from vpd_lightning.viewer.session import to_uint8
 

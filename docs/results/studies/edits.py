@@ -32,7 +32,7 @@ from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.ground_truth import read_state
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.evaluation.bodies import find_bodies
-from vpd_lightning.evaluation.clip import encode_clip
+from vpd_lightning.evaluation.prediction import encode_clip
 from vpd_lightning.loading import load_model
 from vpd_lightning.metrics.chamfer import chamfer
 from vpd_lightning.metrics.surface_distance import nearest_on_surface, surface_of

@@ -25,9 +25,9 @@ from vpd_lightning.config import build_simulator, compose
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.dynamics.inertial import InertialDynamics
-from vpd_lightning.dynamics.rigid_motion import fit_twists, rotate, rotation_from_spin
+from vpd_lightning.dynamics.inertial.rigid_motion import fit_twists, rotate, rotation_from_spin
 from vpd_lightning.evaluation.bodies import find_bodies
-from vpd_lightning.evaluation.clip import encode_clip
+from vpd_lightning.evaluation.prediction import encode_clip
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.simulator import Simulator
 
