@@ -106,7 +106,7 @@ def _read(name: str) -> dict[str, Any]:
 
 
 def _filled(value: Any, scene: Mapping[str, Any]) -> Any:
-    """Resolve ``${scene.KEY}``, what stands at the root of conf/train.yaml, and values by size, of which it is the full."""
+    """Resolve ``${scene.KEY}``, keys of the root of conf/train.yaml, and values by size (the full one)."""
     if isinstance(value, Mapping):
         return {key: _filled(item, scene) for key, item in value.items()}
     if isinstance(value, list):
