@@ -17,12 +17,13 @@ from vpd_lightning.viewer.opened_scene import OpenedScene
 from vpd_lightning.viewer.progressive_view import ProgressiveView, Request, Viewpoint
 from vpd_lightning.viewer.scene_drawing import SceneDrawing
 from vpd_lightning.viewer.session import Session
+from vpd_lightning.viewer.tab_host import TabHost
 
 MODES = ("particles", "rendered", "both")
 _POINT_SIZE = 1.5  # centimetres
 
 
-class Panel:
+class Panel(TabHost):
     """Connects a browser with a session; every client has its own, so that nothing is shared but the model."""
 
     def __init__(self, client: viser.ClientHandle, opened: OpenedScene, folder: ExportFolder, num_steps: int):
