@@ -187,7 +187,7 @@ def narrowest_mass(
         neighbors_backend="auto",
         features_backend="auto",
         is_sorted=False,
-        is_recomputed=False,
+        is_checkpointed=False,
         variant=None,
     )(points[:, :, None])
     return masses[:, :, 0, 0]

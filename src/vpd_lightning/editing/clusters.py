@@ -45,13 +45,13 @@ def object_clusters(particles: Particles) -> Int64[Tensor, " particle"]:
         return labels.to(particles.positions.device)
     points = particles.positions[0].detach().cpu().double().numpy()[where]
     known = particles.moving
-    loose = ~_on_wide_planes(points) if known is None else known[0].cpu().numpy()[where]
+    dynamic_mask = ~_on_wide_planes(points) if known is None else known[0].cpu().numpy()[where]
     found = np.full(len(where), -1)
-    if loose.sum() >= _MIN_PARTICLES:
-        found[loose] = (
-            _divided(points[loose])
+    if dynamic_mask.sum() >= _MIN_PARTICLES:
+        found[dynamic_mask] = (
+            _divided(points[dynamic_mask])
             if particles.normals is None or particles.colors is None
-            else _bodies(particles, where[loose])
+            else _bodies(particles, where[dynamic_mask])
         )
     labels[torch.from_numpy(where)] = torch.from_numpy(_by_size(found))
     return labels.to(particles.positions.device)
