@@ -155,9 +155,7 @@ def _check_views(path: Path, max_pairs: int = MAX_PAIRS) -> _Views:
     return _Views(faults, agreement, free_space)
 
 
-_EXACT = (
-    3e-4  # of the depth: rendered data, or a sensor's millimetres; above it half a pixel is not told from bad poses
-)
+_EXACT = 3e-4  # of the depth: rendered data, or a sensor's millimetres; above it half a pixel looks like bad poses
 _NUMBERS_OF_STATE = (
     schema.STATE_POSITIONS,
     schema.STATE_QUATERNIONS,

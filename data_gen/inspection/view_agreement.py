@@ -25,7 +25,7 @@ _CLEARLY_BETTER = 0.4  # a convention explains the data when it leaves at most t
 _BETTER_IN_PAIR = 0.6  # ... and at most this share of it ...
 _MOST_PAIRS = 0.75  # ... in at least this share of the pairs
 _MIN_OVERLAP = 0.3  # of the points that the convention with the most overlap can compare
-_SAME = 1.5  # two conventions that leave distances within this factor cannot be told apart
+_SAME = 1.5  # two conventions that leave distances within this factor cannot be distinguished
 
 
 @dataclass(frozen=True)

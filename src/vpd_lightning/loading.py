@@ -96,7 +96,7 @@ def load_model(
     except ConfigError as error:
         raise CheckpointError(f"{path} describes a model that this version cannot build.\n{error}") from error
     if sleeping and not config.get("dynamics"):
-        raise ConfigError(f"sleeping=true needs particles, and {path} has none.\nLeave it away.")
+        raise ConfigError(f"sleeping=true needs particles, and {path} has none.\nRemove it.")
     if sleeping:
         config = with_sleeping(config)
     if change:

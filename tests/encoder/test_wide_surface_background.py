@@ -1,4 +1,4 @@
-"""What may move, told from one frame: against scenes whose every pixel is known."""
+"""What may move, found from one frame: against scenes whose every pixel is known."""
 
 from dataclasses import replace
 

@@ -284,7 +284,7 @@ def test_compiled_backend_is_refused_for_what_it_does_not_know() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"kernel_normalization": "mean"}, "kernel_normalization must be null or one of"),
         ({"normalization_epsilon": 0.0}, "normalization_epsilon must be greater than 0"),
@@ -292,9 +292,9 @@ def test_compiled_backend_is_refused_for_what_it_does_not_know() -> None:
         ({"feature_network": small_network(), "kernel_radii": [0, 0]}, "needs a kernel with a radius above 0"),
     ],
 )
-def test_settings_out_of_range_are_refused(changes: dict[str, object], told: str) -> None:
+def test_settings_out_of_range_are_refused(changes: dict[str, object], message: str) -> None:
     for make, settings in ((PointNeRFRenderer, SMALL), (SurfaceRenderer, SMALL_SURFACE)):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             make(**(settings | changes))
 
 

@@ -88,7 +88,7 @@ def evaluate(
     *,
     hide_depth: bool = False,
 ) -> Evaluation:
-    """Evaluate on the protocol's clips. ``progress`` hears what is being done, how much of it, and of how much.
+    """Evaluate on the protocol's clips. ``progress`` receives the task's name, how much is done, and of how much.
 
     ``hide_depth`` shows the system no depth (it is not measured anywhere), for systems that predict it.
 

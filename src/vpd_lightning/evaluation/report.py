@@ -141,7 +141,7 @@ def _long_summary(rollouts: Sequence[LongRollout]) -> dict[str, Any] | None:
         return np.hstack([np.atleast_1d(getattr(rollout, name)) for rollout in rollouts]).astype(np.float64)
 
     def block(decides: str, **figures: tuple[str, Callable[[NDArray[np.float64]], Any]]) -> dict[str, Any]:
-        """All figures of a block speak about the same clips and objects: those whose ``decides`` is a number."""
+        """All figures of a block are over the same clips and objects: those whose ``decides`` is a number."""
         known = np.isfinite(values(decides))
         count = sum(bool(np.isfinite(getattr(rollout, decides)).all()) for rollout in rollouts)
         picked = {name: plain(pick(values(of)[known])) if known.any() else None for name, (of, pick) in figures.items()}

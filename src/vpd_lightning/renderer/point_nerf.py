@@ -39,7 +39,7 @@ from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 class PointNeRFRenderer(AbstractRenderer):
     """Renders rays as the paper's appendix (VPD implementation details, Renderer) and jaxnerf do.
 
-    A coarse tier of ``num_coarse_samples`` stratified samples without view directions says where light is stopped;
+    A coarse tier of ``num_coarse_samples`` stratified samples without view directions locates where light is stopped;
     the fine tier looks at the same samples and ``num_fine_samples`` more, drawn where the coarse weights are, with
     view directions. The coarse samples' neighbours and features are used again by the fine tier.
 
@@ -259,7 +259,7 @@ class PointNeRFRenderer(AbstractRenderer):
         directions: Float[Tensor, "*batch 3"] | None,
         use_color: bool = True,
     ) -> tuple[Tensor, Any]:
-        """Return what a network says of samples; several parts of ``features`` are joined along the samples."""
+        """Return a network's output at samples; several parts of ``features`` are joined along the samples."""
         parts = features if isinstance(features, tuple) else (features,)
 
         def network(*parts: Tensor) -> tuple[Tensor, Tensor | None]:

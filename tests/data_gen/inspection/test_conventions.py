@@ -9,7 +9,7 @@ import pytest
 from data_gen.inspection.fault import Fault
 from data_gen.inspection.validate import check_dataset, convention_errors, validate_dataset
 from tests.data.analytic_scene import known_trajectory
-from tests.data.mistakes import (
+from tests.data_gen.inspection.mistakes import (
     Change,
     as_distance,
     chain,

@@ -182,7 +182,7 @@ class FirstVelocity(nn.Module):
         middle = _masked_mean(target.positions, target.mask)
         heights = weights @ ((target.positions - middle) * target.normals).sum(dim=-1, keepdim=True)
         off_plane = heights.squeeze(-1) - ((at - middle) * normals).sum(dim=-1)
-        # A point whose plane is far off has no match there, whatever the soft one says (Geman-McClure weights).
+        # A point whose plane is far off has no match there, whatever the soft match is (Geman-McClure weights).
         trust = 1 / (1 + (off_plane.detach() / smallest.clamp(min=1e-9)).square())
         plane_weights = belief * trust * (normals.square().sum(dim=-1) > 0.5)
 

@@ -21,13 +21,13 @@ class UnprojectingEncoder(AbstractEncoder):
 
     ``num_particles`` are chosen uniformly at random among the pixels inside the workspace. With ``moving_fraction``
     (and a ``background`` model) up to that share of them is chosen among pixels that may be moving. With
-    ``color_features`` the first three features are the colours of the pixels, whatever the network says.
+    ``color_features`` the first three features are the colours of the pixels, whatever the network predicts.
     """
 
     # Paper: moving_fraction, background, use_normals and color_features are ours; None, None, False, False is the
     # paper.
 
-    # What a person is told to look at where no pixel lies in the workspace.
+    # What the error message names where no pixel lies in the workspace.
     _empty_advice = "Check depth (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A network like PointNeRF's that says how a particle's feature looks from a location near it."""
+"""A network like PointNeRF's that maps a particle's feature and relative location to the feature of a sample."""
 
 import torch
 from jaxtyping import Float
