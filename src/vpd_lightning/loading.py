@@ -19,7 +19,7 @@ class LoadedModel:
     """A trained system in evaluation mode, the plain configuration it was built from, and the file it came from.
 
     ``simulator`` is a ``Simulator`` where the system is made of encoder, dynamics and renderer, and else another kind
-    of ``AbstractSystem``: which one, only the file knows. ``sha256`` is that of the file. ``trained_on`` holds the
+    of ``AbstractSystem``: which one depends on the file. ``sha256`` is that of the file. ``trained_on`` holds the
     SHA-256 of each trajectory that a training of these weights saw (None: the file does not say), ``checkpoint`` what a
     checkpoint says beside its weights and the state of the optimiser (None: a released model).
     """

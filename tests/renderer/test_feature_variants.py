@@ -278,7 +278,7 @@ def test_surface_renderer_gives_its_samples_the_features_of_all_particles(change
 
 def test_compiled_backend_is_refused_for_what_it_does_not_know() -> None:
     for changes in ({"kernel_normalization": "eps"}, {"feature_network": small_network()}):
-        with pytest.raises(ValueError, match=r"features_backend must be auto or torch .* numba knows the plain"):
+        with pytest.raises(ValueError, match=r"features_backend must be auto or torch .* numba supports the plain"):
             PointNeRFRenderer(**(SMALL | {"features_backend": "numba"} | changes))
         PointNeRFRenderer(**(SMALL | {"features_backend": "torch"} | changes))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 # Rank 0 tells the processes it starts where the run lies.
 ENVIRONMENT = "VPD_RUN_FOLDER"
-# What a job's place says already, or what does not change what comes out.
+# Keys that the folder's path gives already, or that do not change the results.
 _UNNAMED = ("sweep", "sweep_name", "experiment", "resume", "evaluate", "num_threads", "debug")
 _UNNAMED_SECTIONS = ("run.", "hydra.", "hydra/")
 _MAX_SLUG = 100

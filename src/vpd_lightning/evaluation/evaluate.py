@@ -36,7 +36,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Everything measured; the first axis of every array counts clips, ``trajectory`` says whose clip each one is.
+    """Everything measured; the first axis of every array counts clips, ``trajectory`` is the trajectory of each clip.
 
     ``images[system][metric]`` and ``native[metric]`` (at the system's own ``resolution``) are [clip, view, step],
     ``reconstruction[metric]`` [clip, view, 1], ``motion[metric]`` [clip, object, step], and ``blocks[metric][part]``

@@ -1,4 +1,4 @@
-"""What an evaluation says: ``metrics.json``, ``metrics.csv``, ``arrays.npz`` and a compact table."""
+"""The results of an evaluation: ``metrics.json``, ``metrics.csv``, ``arrays.npz`` and a compact table."""
 
 import csv
 import json
@@ -130,7 +130,7 @@ def _ratio(error: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[s
 
 
 def _long_summary(rollouts: Sequence[LongRollout]) -> dict[str, Any] | None:
-    """Summarise over clips and objects; ``count`` says how many clips have values, for every object of theirs.
+    """Summarise over clips and objects; ``count`` is how many clips have values, for every object of theirs.
 
     A clip has none where its rollout is not finite, or where its particles hardly show the object.
     """

@@ -139,9 +139,9 @@ def write_moment_sheet(
     maps = {name: getattr(rendered, name).select(axis, 0).numpy()[picked] for name in save_maps}
     notes = []
     opacity = rendered.opacity.select(axis, 0).numpy()[picked]
-    for kind, (pictures, says) in map_pictures(maps, opacity).items():
+    for kind, (pictures, caption) in map_pictures(maps, opacity).items():
         lines[kind] = pictures
-        notes.append(says)
+        notes.append(caption)
     title = "; ".join([f"step {step}", *notes])
     write_view_sheet(folder / "contact_sheet.png", lines, [viewpoints.labels[i] for i in picked], title)
 

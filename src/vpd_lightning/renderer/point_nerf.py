@@ -121,7 +121,7 @@ class PointNeRFRenderer(AbstractRenderer):
         if not self.variant.is_plain and features_backend not in ("auto", "torch"):
             raise ValueError(
                 f"features_backend must be auto or torch with kernel_normalization or feature_network: "
-                f"{features_backend} knows the plain features only."
+                f"{features_backend} supports the plain features only."
             )
         self.num_neighbors = num_neighbors
         self.kernel_radii = tuple(float(radius) for radius in kernel_radii)

@@ -14,7 +14,7 @@ from vpd_lightning.runs.run_claim import is_claimed, lock
 
 DONE, SKIPPED, RESUMED, FAILED, TAKEN = "done", "skipped", "resumed", "failed", "taken by another process"
 FINISHED = "finished"
-"""File that says of a job's run folder that nothing is left to do there."""
+"""File that marks a job's run folder as done."""
 _LOCKS = ".jobs"
 
 
