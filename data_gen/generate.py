@@ -173,7 +173,7 @@ def _choose_backend(renderer: str) -> str:
     if renderer == "blender":
         from data_gen.blender.process import find_python
 
-        find_python()  # better told now than by each worker
+        find_python()  # fails here once rather than in each worker
         return renderer
     from data_gen.gl_backend import choose_backend
 

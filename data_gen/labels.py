@@ -1,4 +1,4 @@
-"""What a segmentation says."""
+"""The labels of a segmentation."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Labels:
-    """What the segmentation says where a MuJoCo object is seen: 0 background, i + 1 object i."""
+    """The label of the segmentation where a MuJoCo object is seen: 0 background, i + 1 object i."""
 
     geoms: NDArray[np.uint8]  # (model.ngeom,)
     flexes: NDArray[np.uint8]  # (model.nflex,)

@@ -15,7 +15,7 @@ from vpd_lightning.data import schema
 
 
 @dataclass(frozen=True)
-class Film:
+class RenderedTrajectory:
     """The pictures of one trajectory."""
 
     rgb: NDArray[np.uint8]  # (time, view, height, width, 3)
@@ -23,7 +23,7 @@ class Film:
     segmentation: NDArray[np.uint8]  # (time, view, height, width)
 
 
-def film(
+def simulate_and_render(
     settings: SceneSettings,
     model: Any,
     data: Any,
@@ -31,7 +31,7 @@ def film(
     clock: StageClock,
     check_stop: Callable[[], None],
     observe: Callable[[int], None],
-) -> Film:
+) -> RenderedTrajectory:
     """Simulate and draw ``settings.num_frames`` frames from the state that ``data`` holds.
 
     ``check_stop`` is called before each frame and may raise; ``observe(frame)`` sees ``data`` as the frame shows it.
@@ -40,7 +40,9 @@ def film(
 
     camera = settings.camera
     shape = (settings.num_frames, camera.num_views, camera.height, camera.width)
-    pictures = Film(np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.uint8))
+    pictures = RenderedTrajectory(
+        np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.uint8)
+    )
     for frame in range(settings.num_frames):
         check_stop()
         with clock.measure("simulate"):
@@ -55,7 +57,7 @@ def film(
 
 def trajectory_of(
     settings: SceneSettings,
-    pictures: Film,
+    pictures: RenderedTrajectory,
     *,
     state: Mapping[str, NDArray[Any]],
     seed: int,
@@ -63,7 +65,7 @@ def trajectory_of(
     scene_hash: str,
     attributes: Mapping[str, Any],
 ) -> schema.Trajectory:
-    """Return what the file of a generated trajectory holds; the film's segmentation joins ``state``."""
+    """Return what the file of a generated trajectory holds; the rendered segmentation joins ``state``."""
     return schema.Trajectory(
         rgb=pictures.rgb,
         depth=pictures.depth,

@@ -176,7 +176,7 @@ def stop() -> None:
 
 def serve(channel: socket.socket) -> dict[str, Any] | None:
     """Fork for each request. Returns None when there will be no more, and in each fork the request."""
-    children: dict[int, tuple[int, int]] = {}  # descriptor of a process -> its number and where its end is told
+    children: dict[int, tuple[int, int]] = {}  # descriptor of a process -> its number and where its end is reported
     while True:
         ready, _, _ = select.select([channel, *children], [], [])
         for descriptor in ready:

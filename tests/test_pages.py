@@ -1,4 +1,4 @@
-"""Files, modules, functions, options and sizes that the pages speak of exist."""
+"""Files, modules, functions, options and sizes that the pages name exist."""
 
 import ast
 import importlib.util

@@ -106,8 +106,8 @@ def test_checkpointed_dynamics_gives_the_same_gradients():
         model(batch()).rendered.rgbs.square().sum().backward()
         gradients.append([parameter.grad.clone() for parameter in model.parameters()])
 
-    for plain, recomputed in zip(*gradients, strict=True):
-        assert torch.equal(plain, recomputed)
+    for plain, checkpointed in zip(*gradients, strict=True):
+        assert torch.equal(plain, checkpointed)
 
 
 def test_noise_is_for_training_only():

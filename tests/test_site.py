@@ -177,8 +177,8 @@ def test_settings_that_a_section_lists_are_there(command: str) -> None:
     assert keys
     root = command.removeprefix("vpd-")
     if not (config_folder() / f"{root}.yaml").is_file():
-        told = help_of(command)
-        assert not [key for key in keys if not re.search(rf"\b{re.escape(key)}\b", told)]
+        printed = help_of(command)
+        assert not [key for key in keys if not re.search(rf"\b{re.escape(key)}\b", printed)]
         return
     needed = {"train": ["experiment=mujoco_block"], "bench": ["suite=all"], "export": ["ckpt=x", "out=y"]}
     config = compose(root, needed.get(root, ["ckpt=x"]))

@@ -69,7 +69,7 @@ def extract(abstract: AbstractScene, data: Any, camera_ids: list[int]) -> Extrac
     """Describe a model; ``data`` is any state of it with forward kinematics done.
 
     Raises:
-        RenderingBackendError: the model holds something that Blender is not told to draw.
+        RenderingBackendError: the model holds something that the Blender export does not support.
     """
     model, scene = abstract.model, abstract.scene
     geoms = abstract.update(data)

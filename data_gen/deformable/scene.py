@@ -17,7 +17,7 @@ from data_gen.deformable.settings import DeformableSettings
 from data_gen.deformable.soft_bodies import SimulationFailedError, SoftBodies
 from data_gen.labels import Labels
 from data_gen.renderers import open_renderer
-from data_gen.simulate_and_render import film, trajectory_of
+from data_gen.simulate_and_render import simulate_and_render, trajectory_of
 from data_gen.stage_clock import StageClock
 from vpd_lightning.data import schema
 from vpd_lightning.errors import DataError
@@ -80,7 +80,7 @@ class DeformableScene:
         with clock.measure("render"):
             renderer = open_renderer(self.renderer, model, settings, labels)
         try:
-            pictures = film(settings, model, data, renderer, clock, check_stop, bodies.observe)
+            pictures = simulate_and_render(settings, model, data, renderer, clock, check_stop, bodies.observe)
         finally:
             renderer.close()
         return trajectory_of(

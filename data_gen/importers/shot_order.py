@@ -37,7 +37,7 @@ def order_shots(shots: Sequence[Shot], frame_time: float | None, settings: Impor
     ``frame_time`` is what the source says, seconds; ``None`` where it does not.
 
     Raises:
-        DataError: time or camera cannot be told, cameras lack images, or frames are not evenly spaced.
+        DataError: time or camera cannot be determined, cameras lack images, or frames are not evenly spaced.
     """
     cameras = _cameras(shots, where)
     views = sorted(set(cameras), key=_natural)

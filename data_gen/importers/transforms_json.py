@@ -2,7 +2,7 @@
 
 Each entry of ``frames`` has ``file_path``, ``transform_matrix`` (camera to world, OpenGL axes) and a depth image,
 ``depth_file_path`` (nerfstudio) or ``depth_path`` (instant-ngp). Two more keys say what those programs do not need:
-``time`` in seconds and ``camera`` (or ``camera_id``). Without them, several cameras are told apart by their folders or
+``time`` in seconds and ``camera`` (or ``camera_id``). Without them, several cameras are separated by their folders or
 by ``cam3`` (``camera``, ``view``) in the file names, and frames by the last number in the name.
 
 Cameras: ``fl_x fl_y cx cy w h k1 k2 k3 p1 p2``, for all frames or in each, or ``camera_angle_x``. The principal point

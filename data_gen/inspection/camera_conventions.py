@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_gen.inspection.posed_depth import Array, Shot
+from data_gen.inspection.posed_depth import Array, PosedDepth
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _AXES = {
@@ -37,7 +37,7 @@ _SHIFTS = {
 
 
 @dataclass(frozen=True)
-class Reading:
+class CameraConvention:
     """One way to read a file; the default is what the format prescribes.
 
     ``ray_power`` multiplies depth by that power of the ray's length; the scales multiply depth and camera positions;
@@ -52,7 +52,7 @@ class Reading:
 
     @property
     def changes(self) -> tuple[str, ...]:
-        """What is different from the prescribed reading, each with its remedy."""
+        """What is different from the prescribed convention, each with its remedy."""
         texts = (
             _AXES[self.axes],
             _DEPTHS[self.ray_power],
@@ -91,36 +91,38 @@ class Reading:
             return scaled
         return scaled * np.linalg.norm(rays, axis=-1) ** self.ray_power
 
-    def read(self, shot: Shot) -> Shot:
+    def read(self, image: PosedDepth) -> PosedDepth:
         """Return the whole image in our convention."""
-        intrinsics = self.intrinsics(shot.intrinsics)
-        height, width = shot.depth.shape
+        intrinsics = self.intrinsics(image.intrinsics)
+        height, width = image.depth.shape
         y = (np.arange(height)[:, None] + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
         x = (np.arange(width)[None, :] + 0.5 - intrinsics[0, 2] - intrinsics[0, 1] * y) / intrinsics[0, 0]
         rays = np.stack(np.broadcast_arrays(x, y, np.ones(())), axis=-1)
-        depth = self.z_depth(shot.depth.astype(np.float64), rays).astype(np.float32)
-        return Shot(depth, intrinsics, self.pose(shot.cam_to_world))
+        depth = self.z_depth(image.depth.astype(np.float64), rays).astype(np.float32)
+        return PosedDepth(depth, intrinsics, self.pose(image.cam_to_world))
 
 
-STORED = Reading()
+STORED = CameraConvention()
 
 
-def single_mistakes() -> list[Reading]:
-    """Readings that differ from the prescribed one in a single thing."""
-    return [reading for reading in without_shift() if len(reading.changes) == 1] + with_shifts(STORED)
+def single_mistakes() -> list[CameraConvention]:
+    """Conventions that differ from the prescribed one in a single thing."""
+    return [convention for convention in without_shift() if len(convention.changes) == 1] + with_shifts(STORED)
 
 
-def without_shift() -> list[Reading]:
+def without_shift() -> list[CameraConvention]:
     """All combinations except those of the principal point."""
-    readings = [
-        Reading(axes, ray_power, depth_scale)
+    conventions = [
+        CameraConvention(axes, ray_power, depth_scale)
         for axes, ray_power, depth_scale in itertools.product(_AXES, _DEPTHS, _SCALES)
     ]
-    readings += [Reading(depth_scale=scale) for scale in _UNITS]
+    conventions += [CameraConvention(depth_scale=scale) for scale in _UNITS]
     # To views alone, positions that are too large look like depths that are too small.
-    return readings + [replace(r, depth_scale=1.0, translation_scale=1e-3) for r in readings if r.depth_scale == 1e3]
+    return conventions + [
+        replace(r, depth_scale=1.0, translation_scale=1e-3) for r in conventions if r.depth_scale == 1e3
+    ]
 
 
-def with_shifts(reading: Reading) -> list[Reading]:
-    """The same reading with the principal point half a pixel further, and nearer."""
-    return [replace(reading, pixel_shift=shift) for shift in _SHIFTS if shift]
+def with_shifts(convention: CameraConvention) -> list[CameraConvention]:
+    """The same convention with the principal point half a pixel further, and nearer."""
+    return [replace(convention, pixel_shift=shift) for shift in _SHIFTS if shift]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from data_gen.inspection.posed_depth import Shot, ShotKey, choose_pairs, read_shots
+from data_gen.inspection.posed_depth import ImageKey, PosedDepth, choose_pairs, read_posed_depth
 from vpd_lightning.data.reader import TrajectoryReader
 
 MAX_SHARE = 0.01
@@ -49,16 +49,16 @@ def free_space_violations(
         if times is None:
             count = min(reader.num_frames, _MAX_FRAMES)
             times = np.unique(np.linspace(0, reader.num_frames - 1, count).round().astype(int)).tolist()
-        pairs: list[tuple[ShotKey, ShotKey]] = []
+        pairs: list[tuple[ImageKey, ImageKey]] = []
         for time in times:
             pairs += choose_pairs(reader, max(1, max_pairs // len(times)), [time])
-        shots = read_shots(reader, [key for pair in pairs for key in pair])
+        images = read_posed_depth(reader, [key for pair in pairs for key in pair])
         tolerance = TOLERANCE * float(np.max(np.subtract(reader.workspace_max, reader.workspace_min)))
-    minima = {key: _nearest_of_nine(shot.depth) for key, shot in shots.items()}
-    noise = float(np.median([depth_noise(shot) for shot in shots.values()])) if shots else 0.0
+    minima = {key: _nearest_of_nine(image.depth) for key, image in images.items()}
+    noise = float(np.median([depth_noise(image) for image in images.values()])) if images else 0.0
     counts: dict[tuple[int, int], NDArray[np.int64]] = {}
     for first, second in pairs:
-        here = _count(shots[first], shots[second], minima[second], tolerance, noise)
+        here = _count(images[first], images[second], minima[second], tolerance, noise)
         key = first[1], second[1]
         counts[key] = counts.get(key, np.zeros(3, np.int64)) + here
     total = sum(counts.values(), np.zeros(3, np.int64))
@@ -72,13 +72,13 @@ def free_space_violations(
     )
 
 
-def depth_noise(shot: Shot) -> float:
+def depth_noise(image: PosedDepth) -> float:
     """Estimate the noise of an image: one standard deviation over depth, from second differences of inverse depth.
 
     Planes have none; what a minority of curved or broken places has does not move the median.
     """
-    valid = shot.depth > 0
-    inverse = np.divide(1.0, shot.depth, out=np.zeros(shot.depth.shape), where=valid)
+    valid = image.depth > 0
+    inverse = np.divide(1.0, image.depth, out=np.zeros(image.depth.shape), where=valid)
     bends = np.abs(inverse[:, 2:] - 2 * inverse[:, 1:-1] + inverse[:, :-2])
     is_whole = valid[:, 2:] & valid[:, 1:-1] & valid[:, :-2]
     if not is_whole.any():
@@ -88,7 +88,7 @@ def depth_noise(shot: Shot) -> float:
 
 
 def _count(
-    first: Shot, second: Shot, nearest: NDArray[np.float32], tolerance: float, noise: float
+    first: PosedDepth, second: PosedDepth, nearest: NDArray[np.float32], tolerance: float, noise: float
 ) -> NDArray[np.int64]:
     """Return how many points of ``first`` are compared, in front, and in front beyond the noise."""
     pose = second.cam_to_world

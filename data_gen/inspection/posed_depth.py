@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from vpd_lightning.data.reader import TrajectoryReader
 
 Array = NDArray[np.float64]
-ShotKey = tuple[int, int]  # frame, view
+ImageKey = tuple[int, int]  # frame, view
 _BEST_ANGLE = 35.0  # degrees between two cameras: much parallax, and still mostly the same surfaces
 _MAX_VIEWS = 32  # evenly chosen: pairs grow with the square
 _MAX_TIMES_FIXED, _MAX_TIMES_MOVING = 3, 12
 
 
 @dataclass(frozen=True)
-class Shot:
+class PosedDepth:
     """One view at one time: z-depth (height, width) in metres, 0 = none; intrinsics (pixels); cam_to_world (metres)."""
 
     depth: NDArray[np.float32]
@@ -37,18 +37,18 @@ def rays(intrinsics: Array, columns: NDArray[np.int64], rows: NDArray[np.int64])
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
-def read_shots(reader: TrajectoryReader, keys: Sequence[ShotKey]) -> dict[ShotKey, Shot]:
+def read_posed_depth(reader: TrajectoryReader, keys: Sequence[ImageKey]) -> dict[ImageKey, PosedDepth]:
     """Read the named images, each once."""
-    shots = {}
+    images = {}
     for time, view in dict.fromkeys(keys):
         intrinsics, cam_to_world = (part[0, 0] for part in reader.cameras([time], [view]))
-        shots[time, view] = Shot(reader.depth([time], [view])[0, 0], intrinsics, cam_to_world)
-    return shots
+        images[time, view] = PosedDepth(reader.depth([time], [view])[0, 0], intrinsics, cam_to_world)
+    return images
 
 
 def choose_pairs(
     reader: TrajectoryReader, max_pairs: int, times: Sequence[int] | None = None
-) -> list[tuple[ShotKey, ShotKey]]:
+) -> list[tuple[ImageKey, ImageKey]]:
     """Choose ordered pairs of images to compare: views of one time, and with moving cameras also one view at two times.
 
     Preferred are pairs whose cameras are turned against each other by some 35 degrees, spread over views and times.
@@ -70,8 +70,8 @@ def choose_pairs(
     # Rounded, so that equal angles keep their order whatever the machine's last digits.
     angles = {pair: round(angle_between(rotations[pair[0]], rotations[pair[1]]), 3) for pair in pairs}
     pairs.sort(key=lambda pair: abs(angles[pair] - _BEST_ANGLE))
-    chosen: list[tuple[ShotKey, ShotKey]] = []
-    uses: dict[ShotKey, int] = dict.fromkeys(rotations, 0)
+    chosen: list[tuple[ImageKey, ImageKey]] = []
+    uses: dict[ImageKey, int] = dict.fromkeys(rotations, 0)
     limit = 1
     while len(chosen) < min(max_pairs, len(pairs)):  # every image once before any is used more often
         for pair in pairs:

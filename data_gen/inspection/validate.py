@@ -11,10 +11,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from data_gen.inspection.camera_conventions import STORED, Reading, single_mistakes
+from data_gen.inspection.camera_conventions import STORED, CameraConvention, single_mistakes
 from data_gen.inspection.fault import Fault
 from data_gen.inspection.free_space import MAX_SHARE, FreeSpace, free_space_violations
-from data_gen.inspection.posed_depth import Shot
+from data_gen.inspection.posed_depth import PosedDepth
 from data_gen.inspection.view_agreement import MAX_PAIRS, Agreement, compare_views
 from vpd_lightning.data import schema
 from vpd_lightning.data.ground_truth import has_state, read_state
@@ -116,7 +116,7 @@ def validate_trajectory(path: Path) -> list[Fault]:
                 reader.rgb([time])
                 depth = reader.depth([time])
                 is_measured = is_measured or bool((depth > 0).any())
-                is_inside = is_inside or _inside_share(_shots(reader, time, depth), STORED, reader) > 0
+                is_inside = is_inside or _inside_share(_posed_depth(reader, time, depth), STORED, reader) > 0
             if is_measured and not is_inside:
                 faults.append(Fault("empty_workspace", str(path), _empty_workspace(reader)))
             faults += _check_state(path, reader)
@@ -129,9 +129,9 @@ def validate_trajectory(path: Path) -> list[Fault]:
 
 
 def convention_errors(path: Path) -> dict[str, float]:
-    """Return, per reading of the conventions, the median distance between views relative to depth.
+    """Return, per camera convention, the median distance between views relative to depth.
 
-    ``as stored`` is the reading the format prescribes. Empty where there is no second look at anything.
+    ``as stored`` is the convention the format prescribes. Empty where there is no second look at anything.
     """
     with TrajectoryReader(path) as reader:
         agreement = compare_views(reader)
@@ -155,9 +155,7 @@ def _check_views(path: Path, max_pairs: int = MAX_PAIRS) -> _Views:
     return _Views(faults, agreement, free_space)
 
 
-_EXACT = (
-    3e-4  # of the depth: rendered data, or a sensor's millimetres; above it half a pixel is not told from bad poses
-)
+_EXACT = 3e-4  # of the depth: rendered data, or a sensor's millimetres; above it half a pixel looks like bad poses
 _NUMBERS_OF_STATE = (
     schema.STATE_POSITIONS,
     schema.STATE_QUATERNIONS,
@@ -192,7 +190,7 @@ def _judge(path: Path, agreement: Agreement) -> list[Fault]:
             return [Fault("views_disagree", str(path), message, is_error=False)]
         return [Fault("views_disagree", str(path), f"{apart}: are the cameras calibrated, and do their times agree?")]
     if agreement.undecidable:
-        listed = " | ".join(str(reading).split(":")[0] for reading in agreement.undecidable)
+        listed = " | ".join(str(convention).split(":")[0] for convention in agreement.undecidable)
         is_noise = agreement.distance > _NOISY
         reason = "the depth's noise hides" if is_noise else "views too alike, or surfaces too flat, to tell"
         message = f"{reason} whether: {listed}"
@@ -227,31 +225,33 @@ def _summary(path: Path, compared: list[_Views]) -> str:
     return f"{path}: {len(compared)} {'file' if len(compared) == 1 else 'files'} compared, " + ", ".join(parts)
 
 
-def _shots(reader: TrajectoryReader, time: int, depth: NDArray[np.float32]) -> list[Shot]:
+def _posed_depth(reader: TrajectoryReader, time: int, depth: NDArray[np.float32]) -> list[PosedDepth]:
     intrinsics, cam_to_world = (array[0] for array in reader.cameras([time]))
-    return [Shot(*parts) for parts in zip(depth[0], intrinsics, cam_to_world, strict=True)]
+    return [PosedDepth(*parts) for parts in zip(depth[0], intrinsics, cam_to_world, strict=True)]
 
 
-def _inside_share(shots: list[Shot], reading: Reading, reader: TrajectoryReader) -> float:
+def _inside_share(images: list[PosedDepth], convention: CameraConvention, reader: TrajectoryReader) -> float:
     """Share of the measured points that lie in the workspace; 0 where they all lie in one tiny part of it."""
-    points = np.concatenate([(shot if reading == STORED else reading.read(shot)).points() for shot in shots])
+    points = np.concatenate([(image if convention == STORED else convention.read(image)).points() for image in images])
     low, high = np.array(reader.workspace_min), np.array(reader.workspace_max)
     is_inside = ((points >= low) & (points <= high)).all(axis=-1)
     if not is_inside.any() or (
-        reading != STORED and np.ptp(points[is_inside], axis=0).max() < 0.1 * (high - low).max()
+        convention != STORED and np.ptp(points[is_inside], axis=0).max() < 0.1 * (high - low).max()
     ):
         return 0.0
     return float(is_inside.mean())
 
 
 def _empty_workspace(reader: TrajectoryReader) -> str:
-    """Say that no point is inside, and which reading of poses and depth would bring some there."""
-    shots = _shots(reader, 0, reader.depth([0]))
-    readings = [reading for reading in single_mistakes() if not reading.pixel_shift and not reading.ray_power]
-    readings += [Reading(depth_scale=1e-3, translation_scale=1e-3)]
-    readings += [replace(reading, axes="opengl") for reading in readings if reading.axes == "opencv"]
-    shares = {reading: round(_inside_share(shots, reading, reader), 1) for reading in readings}
-    best = max(readings, key=shares.__getitem__)  # the first, simplest one of equals
+    """Say that no point is inside, and which convention of poses and depth would bring some there."""
+    images = _posed_depth(reader, 0, reader.depth([0]))
+    conventions = [
+        convention for convention in single_mistakes() if not convention.pixel_shift and not convention.ray_power
+    ]
+    conventions += [CameraConvention(depth_scale=1e-3, translation_scale=1e-3)]
+    conventions += [replace(convention, axes="opengl") for convention in conventions if convention.axes == "opencv"]
+    shares = {convention: round(_inside_share(images, convention, reader), 1) for convention in conventions}
+    best = max(conventions, key=shares.__getitem__)  # the first, simplest one of equals
     message = "not one measured pixel lies in the workspace "
     if shares[best]:
         return f"{message}({shares[best]:.0%} would if {best})"

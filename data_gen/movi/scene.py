@@ -17,7 +17,7 @@ from data_gen.movi.throwing import draw_objects, place
 from data_gen.renderers import open_renderer
 from data_gen.rigid_bodies import RigidBodies
 from data_gen.settings import SPLIT_CODES
-from data_gen.simulate_and_render import film, trajectory_of
+from data_gen.simulate_and_render import simulate_and_render, trajectory_of
 from data_gen.stage_clock import StageClock
 from vpd_lightning.data import schema
 
@@ -56,7 +56,7 @@ class MoviScene:
         with clock.measure("render"):
             renderer = open_renderer(self.backend, model, settings, labels_of(model))
         try:
-            pictures = film(settings, model, data, renderer, clock, check_stop, bodies.observe)
+            pictures = simulate_and_render(settings, model, data, renderer, clock, check_stop, bodies.observe)
         finally:
             renderer.close()
         attributes = {

@@ -17,7 +17,7 @@ from data_gen.mujoco_block.settings import MujocoBlockSettings
 from data_gen.renderers import Renderer, open_renderer
 from data_gen.rigid_bodies import RigidBodies
 from data_gen.settings import SPLIT_CODES
-from data_gen.simulate_and_render import film, trajectory_of
+from data_gen.simulate_and_render import simulate_and_render, trajectory_of
 from data_gen.stage_clock import StageClock
 from vpd_lightning.data import schema
 
@@ -62,7 +62,7 @@ def scene_xml(settings: MujocoBlockSettings) -> str:
 </mujoco>"""
 
 
-def toss(settings: MujocoBlockSettings, seed: int, split: str, index: int) -> tuple[NDArray[np.float64], ...]:
+def initial_state(settings: MujocoBlockSettings, seed: int, split: str, index: int) -> tuple[NDArray[np.float64], ...]:
     """Return the initial ``(qpos (7), qvel (6))``; depends on seed, split and index alone."""
     generator = np.random.default_rng([seed, SPLIT_CODES[split], index])
     ranges = settings.toss
@@ -116,9 +116,11 @@ class MujocoBlockScene:
 
         settings, model, data = self.settings, self.model, self.data
         mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:] = toss(settings, seed, split, index)
+        data.qpos[:], data.qvel[:] = initial_state(settings, seed, split, index)
         bodies = RigidBodies(data, num_bodies=1, num_frames=settings.num_frames)
-        pictures = film(settings, model, data, self.renderer, clock or StageClock(), check_stop, bodies.observe)
+        pictures = simulate_and_render(
+            settings, model, data, self.renderer, clock or StageClock(), check_stop, bodies.observe
+        )
         return trajectory_of(
             settings,
             pictures,

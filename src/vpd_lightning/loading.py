@@ -19,7 +19,7 @@ class LoadedModel:
     """A trained system in evaluation mode, the plain configuration it was built from, and the file it came from.
 
     ``simulator`` is a ``Simulator`` where the system is made of encoder, dynamics and renderer, and else another kind
-    of ``AbstractSystem``: which one, only the file knows. ``sha256`` is that of the file. ``trained_on`` holds the
+    of ``AbstractSystem``: which one depends on the file. ``sha256`` is that of the file. ``trained_on`` holds the
     SHA-256 of each trajectory that a training of these weights saw (None: the file does not say), ``checkpoint`` what a
     checkpoint says beside its weights and the state of the optimiser (None: a released model).
     """
@@ -96,7 +96,7 @@ def load_model(
     except ConfigError as error:
         raise CheckpointError(f"{path} describes a model that this version cannot build.\n{error}") from error
     if sleeping and not config.get("dynamics"):
-        raise ConfigError(f"sleeping=true needs particles, and {path} has none.\nLeave it away.")
+        raise ConfigError(f"sleeping=true needs particles, and {path} has none.\nRemove it.")
     if sleeping:
         config = with_sleeping(config)
     if change:

@@ -6,7 +6,7 @@ module itself, with a ``DeprecationWarning``.
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -146,7 +146,7 @@ class _MovedLoader(Loader):
 
 class _MovedFinder(MetaPathFinder):
     def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+        self, fullname: str, path: Iterable[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         if fullname in MOVED or fullname in _OLD_PACKAGES:
             return ModuleSpec(fullname, _MovedLoader(), is_package=fullname in _OLD_PACKAGES)

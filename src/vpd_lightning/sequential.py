@@ -137,7 +137,7 @@ class SequentialSimulator(Simulator):
     def forward(self, batch: VideoBatch) -> SimulatorOutput:
         """Roll out and compare features: ``predicted_features`` and ``target_features`` (``batch time point feature``).
 
-        ``point_mass`` (``batch time point``) says how near to encoded particles a point is, see ``narrowest_mass``.
+        ``point_mass`` (``batch time point``) measures how near to encoded particles a point is, see ``narrowest_mass``.
 
         Raises:
             ConfigError: the batch holds no future frames.
@@ -187,7 +187,7 @@ def narrowest_mass(
         neighbors_backend="auto",
         features_backend="auto",
         is_sorted=False,
-        is_recomputed=False,
+        is_checkpointed=False,
         variant=None,
     )(points[:, :, None])
     return masses[:, :, 0, 0]

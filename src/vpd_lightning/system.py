@@ -13,7 +13,7 @@ class AbstractSystem(nn.Module, ABC):
     """A model of video that one LightningModule can train: its output and the batch go to the losses.
 
     The direct children of a system are its stages; an optimiser gives each its own learning rate.
-    ``num_context_frames`` says how many frames ``predict_frames`` needs to see.
+    ``num_context_frames`` is the number of frames that ``predict_frames`` needs.
     """
 
     num_context_frames: int

@@ -22,7 +22,7 @@ def _moved(value: Any, *args: Any, **kwargs: Any) -> Any:
     return value.to(*args, **kwargs) if isinstance(value, (Tensor, _Border)) else value
 
 
-# None may be given; readers always find a tensor (see Particles.__post_init__), and the type checker is told so.
+# None may be given; readers always find a tensor (see Particles.__post_init__), and the annotations say so.
 _Mask: TypeAlias = Tensor if TYPE_CHECKING else Bool[Tensor, "*batch particle"] | None  # type: ignore[valid-type]
 
 
@@ -146,7 +146,7 @@ class Rays(_Border):
 
 @dataclass(frozen=True)
 class RenderedRays(_Border):
-    """What a renderer says of each ray: colour in [0, 1], expected distance along the ray (metres), opacity in [0, 1].
+    """A renderer's output for each ray: colour in [0, 1], expected distance along the ray (metres), opacity in [0, 1].
 
     ``coarse_rgbs`` is the coarse tier's colour where a renderer has one and it is supervised.
     """

@@ -39,7 +39,7 @@ MAINS = {
 
 @dataclass(frozen=True)
 class Mistake:
-    """What went wrong, the command as one would type it, its exit code, and what else is done before and told."""
+    """What went wrong, the command as one would type it, its exit code, and what else is done before and printed."""
 
     title: str
     command: str

@@ -43,12 +43,12 @@ def test_the_answer_that_is_shown_is_the_one_that_is_given() -> None:
 
 
 def test_the_refusal_that_is_shown_is_the_one_that_is_given() -> None:
-    line, *told = next(block for block in BLOCKS if block.startswith("$ ")).splitlines()
+    line, *printed = next(block for block in BLOCKS if block.startswith("$ ")).splitlines()
 
     with pytest.raises(ConfigError) as refusal:
         compose("train", shlex.split(line.removeprefix("$ vpd-train ")))
 
-    assert [word.removeprefix("error:").strip() for word in told] == str(refusal.value).splitlines()
+    assert [word.removeprefix("error:").strip() for word in printed] == str(refusal.value).splitlines()
 
 
 def test_files_that_are_named_are_there() -> None:

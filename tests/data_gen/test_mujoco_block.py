@@ -6,7 +6,7 @@ import torch
 
 from data_gen import mujoco_block
 from data_gen.cameras import camera_intrinsics, camera_poses
-from data_gen.mujoco_block.scene import toss
+from data_gen.mujoco_block.scene import initial_state
 from data_gen.settings import differences, load_settings, preset_names
 from tests.data_gen.blocks import small_scene
 from vpd_lightning.data.ground_truth import GroundTruth
@@ -107,7 +107,7 @@ def test_block_flies_for_four_frames_and_lands_inside(preset: str):
     inside = 0
     for index in range(30):
         mujoco.mj_resetData(scene.model, scene.data)
-        scene.data.qpos[:], scene.data.qvel[:] = toss(settings, 0, "train", index)
+        scene.data.qpos[:], scene.data.qvel[:] = initial_state(settings, 0, "train", index)
         for _ in range(3):
             mujoco.mj_step(scene.model, scene.data, settings.substeps)
             assert scene.data.ncon == 0

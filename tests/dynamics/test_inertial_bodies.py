@@ -50,8 +50,8 @@ def test_more_bodies_than_places_and_no_bodies_are_borne():
         assert torch.isfinite(states[-1].positions).all()
 
 
-@pytest.mark.parametrize(("gap", "hears"), [(0.4, False), (0.05, True)])
-def test_learned_forces_on_a_body_know_of_others_in_reach_alone(gap, hears):
+@pytest.mark.parametrize(("gap", "interacts"), [(0.4, False), (0.05, True)])
+def test_learned_forces_on_a_body_depend_on_others_within_the_contact_range_alone(gap, interacts):
     """A body that was left alone by an edit moves as one whose neighbours are out of reach."""
     previous, current = two_cubes(gap)
     model = dynamics(num_probes=240)
@@ -64,7 +64,7 @@ def test_learned_forces_on_a_body_know_of_others_in_reach_alone(gap, hears):
     together, by_itself = (roll(model, *frames, 1)[-1].positions[0, :120] for frames in ((previous, current), alone))
 
     difference = (together - by_itself).norm(dim=-1).max().item()
-    assert difference > 1e-4 if hears else difference < 1e-5  # metres; matches are drawn anew
+    assert difference > 1e-4 if interacts else difference < 1e-5  # metres; matches are drawn anew
     assert (together - current.positions[0, :120]).norm(dim=-1).max() > 1e-3
 
 

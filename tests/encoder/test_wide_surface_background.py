@@ -1,4 +1,4 @@
-"""What may move, told from one frame: against scenes whose every pixel is known."""
+"""What may move, found from one frame: against scenes whose every pixel is known."""
 
 from dataclasses import replace
 
@@ -16,10 +16,10 @@ def background(**changes):
     return WideSurfaceBackground(**{**SETTINGS, **changes})
 
 
-def scores(loose, body):
+def scores(dynamic_mask, body):
     """Precision and recall of the pixels that may move."""
-    hit = (loose & body).sum().item()
-    return hit / max(1, loose.sum().item()), hit / max(1, body.sum().item())
+    hit = (dynamic_mask & body).sum().item()
+    return hit / max(1, dynamic_mask.sum().item()), hit / max(1, body.sum().item())
 
 
 def noisy(frames, share, seed=0):
@@ -123,10 +123,10 @@ def test_missing_depth_is_never_loose_and_hides_nothing_else(missing):
     holes = torch.rand(frames.depth.shape, generator=torch.Generator().manual_seed(1)) < 0.03
     holes[..., :6, :] = True
 
-    loose = background()(replace(frames, depth=torch.where(holes, missing, frames.depth)))
+    dynamic_mask = background()(replace(frames, depth=torch.where(holes, missing, frames.depth)))
 
-    assert not (loose & holes).any()
-    precision, recall = scores(loose, (shown == 1) & ~holes)
+    assert not (dynamic_mask & holes).any()
+    precision, recall = scores(dynamic_mask, (shown == 1) & ~holes)
     assert precision > 0.9 and recall > 0.9
 
 

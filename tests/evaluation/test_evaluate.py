@@ -230,13 +230,13 @@ def test_protocols_that_make_no_sense_are_refused(changes: dict[str, object], me
 
 
 def test_progress_counts_clips(manifest: Manifest, test_paths: list[Path]) -> None:
-    heard: list[tuple[str, int, int]] = []
+    calls: list[tuple[str, int, int]] = []
 
     def listen(what: str, done: int, total: int) -> None:
-        heard.append((what, done, total))
+        calls.append((what, done, total))
 
     evaluate(Oracle(test_paths), manifest, protocol_with(num_trajectories=1), [0], progress=listen)
-    assert ("clips", 1, 2) in heard and ("long rollouts", 0, 1) in heard
+    assert ("clips", 1, 2) in calls and ("long rollouts", 0, 1) in calls
 
 
 def test_first_clips_are_kept_for_pictures(manifest: Manifest, protocol: Protocol, test_paths: Sequence[Path]) -> None:

@@ -20,7 +20,7 @@ def sheet(height=None):
     return np.stack([x, y, z], axis=-1)[None], normals[None]
 
 
-def told(points, normals, valid=None, **changes):
+def wide_mask(points, normals, valid=None, **changes):
     valid = np.ones(points.shape[:3], bool) if valid is None else valid
     footprints = np.full(valid.shape, STEP)
     return wide_surfaces(points, normals, valid, footprints, **{**SETTINGS, **changes})
@@ -29,14 +29,14 @@ def told(points, normals, valid=None, **changes):
 def test_a_plane_is_wide_whichever_way_it_faces():
     points, normals = sheet()
     for axes in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
-        assert told(points[..., axes], normals[..., axes]).all()
+        assert wide_mask(points[..., axes], normals[..., axes]).all()
 
 
 def test_a_gentle_hill_is_one_surface_and_a_patch_above_it_is_none():
     points, normals = sheet(lambda x, y: 0.1 * np.sin(2 * x) * np.cos(y))
     points[0, 8:14, 9:15, 2] += 0.6
 
-    wide = told(points, normals)[0]
+    wide = wide_mask(points, normals)[0]
 
     lifted = np.zeros_like(wide)
     lifted[8:14, 9:15] = True
@@ -47,8 +47,8 @@ def test_what_lies_within_the_tolerance_of_a_plane_is_on_it():
     points, normals = sheet()
     points[0, 8:14, 9:15, 2] += 0.4 * STEP  # too steep a step at the rim, but 0.4 footprints high
 
-    assert told(points, normals).all()
-    assert told(points, normals, tolerance=0.3)[0, 8:14, 9:15].sum() == 0
+    assert wide_mask(points, normals).all()
+    assert wide_mask(points, normals, tolerance=0.3)[0, 8:14, 9:15].sum() == 0
 
 
 @pytest.mark.parametrize("view", [0, 1])
@@ -58,7 +58,7 @@ def test_views_see_the_same_surface_though_pixels_of_two_views_are_no_neighbours
     valid[1 - view] = True
     valid[view, 5:9, 5:9] = True  # of this view only a scrap is seen; the other says what it lies on
 
-    assert np.array_equal(told(points, normals, valid), valid)
+    assert np.array_equal(wide_mask(points, normals, valid), valid)
 
 
 def test_the_smallest_width_is_a_share_of_all_that_is_seen():
@@ -67,28 +67,28 @@ def test_the_smallest_width_is_a_share_of_all_that_is_seen():
     valid[0, :, :6] = valid[0, :, 10:11] = True  # a strip of six columns and a line far from it, one plane
     points[0, :, 10:11, 2] += 1.0
 
-    wide = told(points, normals, valid, min_width=0.7)
+    wide = wide_mask(points, normals, valid, min_width=0.7)
 
     # both are as long as all that is seen, and neither is as wide
     assert wide[0, :, :6].all()
-    assert not told(points, normals, valid, min_width=0.99).any()
+    assert not wide_mask(points, normals, valid, min_width=0.99).any()
 
 
 def test_without_valid_points_or_with_one_nothing_is_wide():
     points, normals = sheet()
     valid = np.zeros(points.shape[:3], bool)
-    assert not told(points, normals, valid).any()
+    assert not wide_mask(points, normals, valid).any()
     valid[0, 3, 3] = True
-    assert not told(points, normals, valid).any()
+    assert not wide_mask(points, normals, valid).any()
 
 
 def test_points_that_are_not_valid_may_hold_anything():
     points, normals = sheet()
     valid = np.random.default_rng(0).random(points.shape[:3]) < 0.9
-    expected = told(points, normals, valid)
+    expected = wide_mask(points, normals, valid)
     points[~valid], normals[~valid] = 1e6, 0.0
 
-    assert np.array_equal(told(points, normals, valid), expected)
+    assert np.array_equal(wide_mask(points, normals, valid), expected)
     assert not expected[~valid].any()
 
 
@@ -100,7 +100,7 @@ def test_a_sharp_fold_divides_a_sheet_even_where_normals_along_it_turn_slowly():
         normals[0, row] = np.stack([np.zeros(SIZE), -np.sin(angle), np.cos(angle)], axis=-1)
 
     # the upper part is 12 times as long as it is seen from above; below it is no part of what is wide
-    wide = told(points, normals, min_width=0.6, tolerance=1e-6)[0]
+    wide = wide_mask(points, normals, min_width=0.6, tolerance=1e-6)[0]
 
     assert wide[14:].all() and not wide[:11].any()
 
@@ -115,7 +115,7 @@ def test_a_face_seen_from_the_side_is_not_linked_to_the_floor_far_behind_it():
     points[0][face][..., 2] = 0.66 + np.tan(tilt) * (1.4 - points[0][face][..., 0])
     normals[0][face] = np.sin(tilt), 0.0, np.cos(tilt)
 
-    wide = told(points, normals, min_width=0.3)[0]
+    wide = wide_mask(points, normals, min_width=0.3)[0]
 
     expected = np.ones_like(wide)
     expected[face] = False

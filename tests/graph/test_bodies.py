@@ -93,7 +93,7 @@ def seen_from_above(positions, normals, truth):
 
 
 def share_parted(make, **changes):
-    """In which share of random drawings two bodies that touch are told apart, as two cameras from above see them."""
+    """In which share of random drawings two bodies that touch are separated, as two cameras from above see them."""
     parted = []
     for seed in range(12):
         positions, normals, truth = seen_from_above(*make(seed))

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from vpd_lightning.graph.incidence import Incidence, carried
+from vpd_lightning.graph.incidence import Incidence, gather_to_edges
 
 NUM_SENDERS, NUM_RECEIVERS, NUM_EDGES = 7, 9, 60
 
@@ -13,7 +13,7 @@ def ends(num_edges: int = NUM_EDGES) -> tuple[torch.Tensor, torch.Tensor]:
 
 def through_edges(senders: Incidence, receivers: Incidence, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     rows, more, edges = inputs
-    hidden = carried(rows, senders, more, receivers) + edges
+    hidden = gather_to_edges(rows, senders, more, receivers) + edges
     return receivers.summed(hidden * hidden), senders.summed(hidden)
 
 
@@ -60,7 +60,7 @@ def test_a_table_is_the_same_edges_as_a_list() -> None:
     as_list = Incidence.of(table.index, NUM_SENDERS)
     assert torch.equal(table.index.view(-1, 3) < NUM_SENDERS, mask)
     rows, edges = (torch.randn(n, 4, dtype=torch.float64, requires_grad=True) for n in (NUM_SENDERS, 3 * NUM_SENDERS))
-    found, expected = (one.summed(edges * carried(rows, one)) for one in (table, as_list))
+    found, expected = (one.summed(edges * gather_to_edges(rows, one)) for one in (table, as_list))
     torch.testing.assert_close(found, expected, rtol=1e-13, atol=1e-13)
     gradients = [torch.autograd.grad(one.square().sum(), (rows, edges), retain_graph=True) for one in (found, expected)]
     for one, other in zip(*gradients, strict=True):
@@ -79,7 +79,7 @@ def test_not_a_number_on_padding_stays_there(is_table: bool, dtype: torch.dtype)
     assert total[:, 0].tolist() == [1, 0, 2]
     total.sum().backward()
     assert torch.equal(edges.grad[:, 0] > 0, mask.flatten()), "padding gets a gradient of zero"
-    assert torch.equal(carried(torch.ones(3, 4, dtype=dtype), incidence)[:, 0] > 0, mask.flatten())
+    assert torch.equal(gather_to_edges(torch.ones(3, 4, dtype=dtype), incidence)[:, 0] > 0, mask.flatten())
 
 
 def test_half_precision_is_summed_in_float32() -> None:
@@ -92,7 +92,7 @@ def test_no_edges_and_no_nodes_are_sums_of_nothing() -> None:
     for num_nodes in (0, 4):
         nothing = Incidence.of(torch.zeros(0, dtype=torch.int64), num_nodes)
         rows, edges = torch.randn(num_nodes, 3, requires_grad=True), torch.zeros(0, 3, requires_grad=True)
-        total = nothing.summed(edges + carried(rows, nothing))
+        total = nothing.summed(edges + gather_to_edges(rows, nothing))
         assert torch.equal(total, torch.zeros(num_nodes, 3))
         total.sum().backward()
         assert torch.equal(rows.grad, torch.zeros(num_nodes, 3))

@@ -76,11 +76,11 @@ def test_its_checkpoint_loads_and_its_contract_is_kept(site: Path, run: Path, tm
         f"sys.exit(pytest.main(['-q', '-p', 'no:cacheprovider', '-c', {os.devnull!r}, {str(PACKAGE / 'tests')!r}]))"
     )
 
-    told = python("-c", code, site=site, cwd=tmp_path)
+    printed = python("-c", code, site=site, cwd=tmp_path)
 
-    assert told.split()[:3] == ["my_lab.drift", str(site / "my_lab" / "__init__.py"), "16"]
-    passed = re.search(r"(\d+) passed", told)
-    assert passed and int(passed[1]) >= 10, told
+    assert printed.split()[:3] == ["my_lab.drift", str(site / "my_lab" / "__init__.py"), "16"]
+    passed = re.search(r"(\d+) passed", printed)
+    assert passed and int(passed[1]) >= 10, printed
 
 
 def python(*words: str | Path, site: Path | None = None, cwd: Path | None = None) -> str:

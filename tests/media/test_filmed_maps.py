@@ -10,7 +10,7 @@ from vpd_lightning.dynamics.persistence import PersistenceDynamics
 from vpd_lightning.encoder.base import AbstractEncoder, EncoderOutput
 from vpd_lightning.geometry.cameras import pixel_rays, unproject
 from vpd_lightning.media.filmed_maps import map_pictures, write_maps, z_depth
-from vpd_lightning.media.render_rollout import film
+from vpd_lightning.media.render_rollout import render_rollout
 from vpd_lightning.media.viewpoints import Viewpoints
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
@@ -41,7 +41,7 @@ class Blind(AbstractEncoder):
         raise AssertionError("nothing is encoded here")
 
 
-def filmed_floor(viewpoints: Viewpoints, num_states: int):
+def rendered_floor(viewpoints: Viewpoints, num_states: int):
     simulator = Simulator(
         encoder=Blind(),
         dynamics=PersistenceDynamics(),
@@ -51,7 +51,7 @@ def filmed_floor(viewpoints: Viewpoints, num_states: int):
         pixel_gradient_to_motion=1.0,
     )
     states = [Particles(torch.zeros(1, 1, 3), torch.zeros(1, 1, 2))] * num_states
-    return film(simulator, states, viewpoints, lambda what, done, total: None)
+    return render_rollout(simulator, states, viewpoints, lambda what, done, total: None)
 
 
 def known_depth(view: int) -> np.ndarray:
@@ -60,23 +60,23 @@ def known_depth(view: int) -> np.ndarray:
 
 
 def test_depth_is_along_the_optical_axis() -> None:
-    filmed = filmed_floor(Viewpoints(CAMERAS, False, None, ["a", "b"], ["a", "b"]), 2)
-    assert filmed.depth.shape == filmed.opacity.shape == (2, 2, SIZE, SIZE)
+    rendered = rendered_floor(Viewpoints(CAMERAS, False, None, ["a", "b"], ["a", "b"]), 2)
+    assert rendered.depth.shape == rendered.opacity.shape == (2, 2, SIZE, SIZE)
     for view in range(2):
         known = known_depth(view)
         near = (known > 0) & (known < 4)
         assert near.sum() > 100
-        for depth in filmed.depth[:, view].numpy():
+        for depth in rendered.depth[:, view].numpy():
             np.testing.assert_allclose(depth[near], known[near], rtol=1e-4)
-    heights = unproject(filmed.depth[0], CAMERAS)[filmed.opacity[0] > 0.5][..., 2]
+    heights = unproject(rendered.depth[0], CAMERAS)[rendered.opacity[0] > 0.5][..., 2]
     torch.testing.assert_close(heights, torch.full_like(heights, FLOOR_HEIGHT), atol=1e-3, rtol=0)
 
 
 def test_a_moving_camera_sees_one_moment_from_every_place() -> None:
-    filmed = filmed_floor(Viewpoints(CAMERAS, True, None, ["path"], ["0", "1"]), 1)
-    assert filmed.depth.shape == (2, 1, SIZE, SIZE)
-    still = filmed_floor(Viewpoints(CAMERAS, False, None, ["a", "b"], ["a", "b"]), 1)
-    assert torch.equal(filmed.depth[:, 0], still.depth[0])
+    rendered = rendered_floor(Viewpoints(CAMERAS, True, None, ["path"], ["0", "1"]), 1)
+    assert rendered.depth.shape == (2, 1, SIZE, SIZE)
+    still = rendered_floor(Viewpoints(CAMERAS, False, None, ["a", "b"], ["a", "b"]), 1)
+    assert torch.equal(rendered.depth[:, 0], still.depth[0])
 
 
 def test_z_depth_undoes_what_rays_do() -> None:

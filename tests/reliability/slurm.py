@@ -1,4 +1,4 @@
-"""A real SLURM, of one machine: a job of four tasks hears that its time is up, is queued again, and goes on."""
+"""A real SLURM, of one machine: a job of four tasks is signalled that its time is up, is queued again, and goes on."""
 
 import os
 import re

@@ -278,13 +278,13 @@ def test_surface_renderer_gives_its_samples_the_features_of_all_particles(change
 
 def test_compiled_backend_is_refused_for_what_it_does_not_know() -> None:
     for changes in ({"kernel_normalization": "eps"}, {"feature_network": small_network()}):
-        with pytest.raises(ValueError, match=r"features_backend must be auto or torch .* numba knows the plain"):
+        with pytest.raises(ValueError, match=r"features_backend must be auto or torch .* numba supports the plain"):
             PointNeRFRenderer(**(SMALL | {"features_backend": "numba"} | changes))
         PointNeRFRenderer(**(SMALL | {"features_backend": "torch"} | changes))
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"kernel_normalization": "mean"}, "kernel_normalization must be null or one of"),
         ({"normalization_epsilon": 0.0}, "normalization_epsilon must be greater than 0"),
@@ -292,9 +292,9 @@ def test_compiled_backend_is_refused_for_what_it_does_not_know() -> None:
         ({"feature_network": small_network(), "kernel_radii": [0, 0]}, "needs a kernel with a radius above 0"),
     ],
 )
-def test_settings_out_of_range_are_refused(changes: dict[str, object], told: str) -> None:
+def test_settings_out_of_range_are_refused(changes: dict[str, object], message: str) -> None:
     for make, settings in ((PointNeRFRenderer, SMALL), (SurfaceRenderer, SMALL_SURFACE)):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             make(**(settings | changes))
 
 

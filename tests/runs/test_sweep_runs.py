@@ -1,4 +1,4 @@
-"""Named sweeps: what is done stays done, what was begun goes on, what failed is told."""
+"""Named sweeps: what is done stays done, what was begun goes on, what failed is reported."""
 
 import os
 import sys
@@ -44,15 +44,15 @@ def jobs(options: str, in_folder: Path, dataset: Path) -> list[SweepJob]:
 
 
 class Trainer:
-    """Stands in for a training: what it was told, in which folder, and files as a training leaves them."""
+    """Stands in for a training: its options, in which folder, and files as a training leaves them."""
 
     def __init__(self, error_of: dict[str, BaseException] | None = None):
         self.error_of = error_of or {}
         self.trained: list[Path] = []
-        self.told: list[list[str]] = []
+        self.calls: list[list[str]] = []
 
     def __call__(self, words: list[str]) -> None:
-        self.told.append(words)
+        self.calls.append(words)
         assert words[-2] == "resume=auto"
         seed = next(word for word in words if word.startswith("seed="))
         if seed in self.error_of:
@@ -119,7 +119,7 @@ def test_job_that_is_to_be_evaluated_is_not_done_before(
     trainer = Trainer()
     run_sweep(jobs, trainer, pytest.fail)
 
-    assert all("evaluate=true" in words for words in trainer.told)  # though the runs began with evaluate=false
+    assert all("evaluate=true" in words for words in trainer.calls)  # though the runs began with evaluate=false
     assert statuses(capsys.readouterr().out) == ["skipped", "resumed", "resumed"]
     assert [(job.folder / "evaluation").exists() for job in jobs] == [True, False, False]
     assert (jobs[1].folder / "earlier_evaluation_1" / "metrics.json").is_file()
@@ -128,10 +128,10 @@ def test_job_that_is_to_be_evaluated_is_not_done_before(
 def test_failed_job_is_told_does_not_end_the_sweep_and_is_tried_again(
     jobs: list[SweepJob], capsys: pytest.CaptureFixture[str]
 ):
-    error, told = DataError("nothing there"), []
+    error, reported = DataError("nothing there"), []
 
-    assert run_sweep(jobs, Trainer({"seed=2": error}), told.append) == DataError.exit_code
-    assert told == [error]
+    assert run_sweep(jobs, Trainer({"seed=2": error}), reported.append) == DataError.exit_code
+    assert reported == [error]
     assert statuses(capsys.readouterr().out) == ["done", "failed", "done"]
 
     assert run_sweep(jobs, Trainer(), pytest.fail) == 0
@@ -180,7 +180,7 @@ def test_job_that_the_other_process_gave_up_meanwhile_is_done_in_the_end(
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["sweep=seeds"], "Add -m"),
         (["-m", "sweep=seeds,sizes"], "several sweeps"),
@@ -195,9 +195,9 @@ def test_job_that_the_other_process_gave_up_meanwhile_is_done_in_the_end(
     ],
 )
 def test_mistake_is_found_before_the_first_job(
-    words: list[str], told: str, options: str, in_folder: Path, fails: Callable[..., str]
+    words: list[str], message: str, options: str, in_folder: Path, fails: Callable[..., str]
 ):
-    assert told in fails(train.main, [*words, f"--config-dir={options}"], 2)
+    assert message in fails(train.main, [*words, f"--config-dir={options}"], 2)
 
 
 def test_sweep_trains_starts_anew_what_died_early_and_tells_what_failed(

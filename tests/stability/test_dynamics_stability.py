@@ -13,7 +13,7 @@ from tests.stability.known_faults import known_fault
 from tests.stability.stages import matrix, options, particles_at, stage, variant
 from tests.unchecked_shapes import unchecked_shapes
 from vpd_lightning.dynamics.blocks import FullPrecisionLayerNorm
-from vpd_lightning.graph.incidence import Incidence, carried
+from vpd_lightning.graph.incidence import Incidence, gather_to_edges
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.testing.particle_sets import reordered
 from vpd_lightning.types import Particles
@@ -196,7 +196,7 @@ def test_nothing_of_an_edge_that_is_padding_gets_out(is_table: bool, value: floa
 
     with mode.context(device):
         sums = incidence.summed(edges)
-        rows = carried(torch.ones(3, 4, device=device, dtype=mode.dtype), incidence)
+        rows = gather_to_edges(torch.ones(3, 4, device=device, dtype=mode.dtype), incidence)
     (gradient,) = torch.autograd.grad(sums.sum(), edges)
 
     assert sums[:, 0].tolist() == [1.0, 0.0, 2.0]

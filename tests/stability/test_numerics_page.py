@@ -1,4 +1,4 @@
-"""docs/numerics.md speaks of functions and tests that exist."""
+"""docs/numerics.md names functions and tests that exist."""
 
 import ast
 import re

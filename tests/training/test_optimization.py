@@ -12,7 +12,7 @@ ADAM = {"betas": [0.9, 0.999], "eps": 1e-8}
 
 def test_the_papers_rate_is_divided_by_three_at_each_milestone() -> None:
     settings = StepDecayAdam(lr=3e-4, milestones=[100_000, 300_000], gamma=1 / 3, **ADAM)
-    rates = [3e-4 * settings.share_at(step, 400_000) for step in (0, 99_999, 100_000, 299_999, 300_000, 399_999)]
+    rates = [3e-4 * settings.lr_factor(step, 400_000) for step in (0, 99_999, 100_000, 299_999, 300_000, 399_999)]
     assert rates == pytest.approx([3e-4, 3e-4, 1e-4, 1e-4, 1e-4 / 3, 1e-4 / 3])
 
 
@@ -28,7 +28,7 @@ def test_the_schedule_moves_with_every_update() -> None:
 
 def test_warm_up_rises_linearly_and_the_cosine_falls_to_its_final_share() -> None:
     settings = WarmupCosineAdam(lr=1.0, stage_multipliers={}, warmup_steps=4, final_share=0.1, **ADAM)
-    shares = [settings.share_at(step, 104) for step in range(105)]
+    shares = [settings.lr_factor(step, 104) for step in range(105)]
     assert shares[:5] == pytest.approx([0.25, 0.5, 0.75, 1.0, 1.0])
     assert shares[54] == pytest.approx(0.55)  # half-way between 1 and 0.1
     assert shares[104] == pytest.approx(0.1)

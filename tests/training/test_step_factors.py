@@ -12,7 +12,7 @@ def test_rate_falls_by_each_factor_at_its_share_of_any_training():
 
     for max_steps in (400_000, 100_000):
         quarter = max_steps // 4
-        rates = [adam.share_at(step, max_steps) for step in (0, quarter - 1, quarter, 3 * quarter - 1, 3 * quarter)]
+        rates = [adam.lr_factor(step, max_steps) for step in (0, quarter - 1, quarter, 3 * quarter - 1, 3 * quarter)]
         assert rates == pytest.approx([1, 1, 0.1, 0.1, 0.1 / 3])
 
 

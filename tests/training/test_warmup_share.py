@@ -29,18 +29,18 @@ def schedule(warmup_share: float = 0.05, end_share: float = 0.01) -> WarmupShare
     ],
 )
 def test_rises_from_and_falls_to_a_hundredth(step: int, share: float) -> None:
-    assert schedule().share_at(step, 1000) == pytest.approx(share, rel=1e-12)
+    assert schedule().lr_factor(step, 1000) == pytest.approx(share, rel=1e-12)
 
 
 def test_warm_up_is_a_share_of_the_training_whatever_its_length() -> None:
     for max_steps in (1000, 4000, 83_200):
-        shares = [schedule().share_at(round(part * max_steps), max_steps) for part in (0.025, 0.05, 0.5, 1.0)]
+        shares = [schedule().lr_factor(round(part * max_steps), max_steps) for part in (0.025, 0.05, 0.5, 1.0)]
         assert shares == pytest.approx([0.505, 1.0, shares[2], 0.01])
-        assert shares[2] == pytest.approx(schedule().share_at(500, 1000))
+        assert shares[2] == pytest.approx(schedule().lr_factor(500, 1000))
 
 
 def test_rises_then_falls_without_a_step() -> None:
-    shares = [schedule(0.1).share_at(step, 200) for step in range(201)]
+    shares = [schedule(0.1).lr_factor(step, 200) for step in range(201)]
     assert shares.index(max(shares)) == 20
     assert all(a < b for a, b in zip(shares[:20], shares[1:21], strict=True))
     assert all(a > b for a, b in zip(shares[20:-1], shares[21:], strict=True))
@@ -48,11 +48,11 @@ def test_rises_then_falls_without_a_step() -> None:
 
 
 def test_no_warm_up_starts_at_the_full_rate() -> None:
-    assert schedule(warmup_share=0.0).share_at(0, 10) == 1.0
+    assert schedule(warmup_share=0.0).lr_factor(0, 10) == 1.0
 
 
 def test_a_training_of_one_step_has_a_rate() -> None:
-    assert 0.0 < schedule().share_at(0, 1) <= 1.0
+    assert 0.0 < schedule().lr_factor(0, 1) <= 1.0
 
 
 def test_every_update_takes_its_rate() -> None:

@@ -7,7 +7,7 @@ alone is judged: Chamfer-L1 distance from its particles to points of its surface
 later half of the rollout. The *unedited* rollout is held against the same counterfactual: an edit that the model does
 not take to heart would leave the two alike.
 
-Which particles are the edited body's is told by the true surface, as a person would tell by a click.
+The particles of the edited body are selected by the true surface, as a person would select them by a click.
 """
 
 import argparse

@@ -10,7 +10,7 @@ from vpd_lightning.baselines.slot_transformer import SlotTransformer
 class SlotRollouter(nn.Module):
     """A transformer over all slots of ``num_history`` frames; the newest frame's outputs are the next frame's slots.
 
-    The prediction is direct, without a residual. Frames are told apart by a fixed position code that counts backwards
+    The prediction is direct, without a residual. Frames have a fixed positional encoding that counts backwards
     (newest 0); slots have no code, so that a slot is followed by the place it has in the newest frame alone.
     """
 

@@ -121,7 +121,7 @@ def _validate(places: Sequence[str], settings: dict[str, Any]) -> int:
     if num_errors:
         raise DataError(f"{path} has {num_errors} fault{'s' * (num_errors > 1)}, listed above.")
     is_sure = not any(fault.name == "cannot_tell" for fault in report.faults)
-    print(f"{path} is valid{'.' if is_sure else ', as far as could be told: see the remarks above.'}")
+    print(f"{path} is valid{'.' if is_sure else ', as far as could be checked: see the remarks above.'}")
     return 0
 
 

@@ -31,7 +31,7 @@ def _render(config: Mapping[str, Any]) -> None:
     from vpd_lightning.errors import OutOfMemoryError
     from vpd_lightning.evaluation.prediction import encode_clip
     from vpd_lightning.files import OutputFolder, choose_folder
-    from vpd_lightning.media import render_rollout as filming
+    from vpd_lightning.media import render_rollout
     from vpd_lightning.media.nerfstudio_paths import write_camera_path
     from vpd_lightning.media.viewpoints import choose_viewpoints, resize_viewpoints
     from vpd_lightning.release.results_folder import beside_checkpoint
@@ -46,7 +46,7 @@ def _render(config: Mapping[str, Any]) -> None:
     manifest = data_set(config["data"]["folder"], model.config)
     path = choose_trajectory(manifest, config["split"], config["trajectory"])
     start, freeze_step = config["start_frame"], config["freeze_step"]
-    clip = filming.read_context(path, start)
+    clip = render_rollout.read_context(path, start)
     num_frames = (config["num_views"] if freeze_step is not None else None) or config["num_steps"] + 1
     chosen = choose_viewpoints(
         config["camera"], path, start, num_frames, model.input_views, frozen=freeze_step is not None
@@ -62,21 +62,21 @@ def _render(config: Mapping[str, Any]) -> None:
                 if operations:
                     viewpoint = clip.cameras.cam_to_world[1, :, :3, 3].mean(0)
                     scene = replay(colored_editor(model.simulator, scene, viewpoint), operations).scene
-                states = filming.predict(model.simulator, scene, config["num_steps"], freeze_step)
-                filmed = filming.film(model.simulator, list(states.values()), viewpoints, progress)
+                states = render_rollout.predict(model.simulator, scene, config["num_steps"], freeze_step)
+                rendered = render_rollout.render_rollout(model.simulator, list(states.values()), viewpoints, progress)
         except torch.OutOfMemoryError as error:
             raise OutOfMemoryError(
                 "The device ran out of memory while rendering.\nLower height and width, or use device=cpu."
             ) from error
         truth = None
         if viewpoints.views is not None and not operations:  # of an edited scene there is no truth
-            truth = filming.recorded_frames(path, start, list(states), viewpoints.views)
-        filming.write_films(partial, viewpoints, filmed, truth, config["fps"], config["save_maps"])
+            truth = render_rollout.recorded_frames(path, start, list(states), viewpoints.views)
+        render_rollout.write_videos(partial, viewpoints, rendered, truth, config["fps"], config["save_maps"])
         if freeze_step is not None:
-            filming.write_moment_sheet(partial, viewpoints, filmed, truth, freeze_step, config["save_maps"])
-        filming.write_particle_folder(partial, model.simulator, clip, states, config["save_particles"])
-        is_film = filmed.rgb.shape[0] > 1
-        filming.write_description(
+            render_rollout.write_moment_sheet(partial, viewpoints, rendered, truth, freeze_step, config["save_maps"])
+        render_rollout.write_particle_folder(partial, model.simulator, clip, states, config["save_particles"])
+        is_film = rendered.rgb.shape[0] > 1
+        render_rollout.write_description(
             partial / "render.json",
             {
                 "checkpoint": str(model.path),

@@ -148,11 +148,11 @@ def _check_folder(config: dict[str, Any], *, may_set_aside: bool) -> None:
         return
     path = Path(folder).expanduser()
     if path.is_file():
-        raise ConfigError(f"run.folder={folder} is a file.\nName a folder, or leave run.folder away.")
+        raise ConfigError(f"run.folder={folder} is a file.\nName a folder, or remove run.folder.")
     if not _holds_something(path):
         return
     exists = f"run.folder={folder} exists already, and nothing is overwritten.\n"
-    other = "name another folder; or leave run.folder away."
+    other = "name another folder; or remove run.folder."
     if has_checkpoint(path):
         raise ConfigError(f"{exists}Go on with it: resume={folder}; or {other}")
     if is_claimed(path):

@@ -75,7 +75,7 @@ def settings_lists(table: ComparisonTable) -> list[str]:
 
 
 def winners(table: ComparisonTable) -> list[str]:
-    """One line per metric: who is best, and who cannot be told from it."""
+    """One line per metric: which is best, and which do not differ from it significantly."""
     if len(table.main_rows) > 1 and differing_budgets(table.main_rows):
         return ["No system is called best, here and in the tables: their training budgets differ."]
     lines = []

@@ -26,7 +26,7 @@ def refuse_bypasses(overrides: Sequence[str]) -> None:
             raise ConfigError(
                 f"'{word}' {does} a key behind the schema's back.\n"
                 "Every setting has its place in the configuration; --cfg job lists them all.\n"
-                "To set a key that is there, leave the sign away; a new option goes into a folder for --config-dir."
+                "To set a key that is there, remove the sign; a new option goes into a folder for --config-dir."
             )
 
 
@@ -125,7 +125,7 @@ def _explain_unknown_key(
     try:
         others = [word for word in overrides if "." not in word.partition("=")[0] and not word.startswith(key)]
         if len(others) == len(overrides):  # an option's own fault: fewer words would end here again
-            return ConfigError(f"{str(cause).splitlines()[0]}\nThe options chosen do not fit together; leave one away.")
+            return ConfigError(f"{str(cause).splitlines()[0]}\nThe options chosen do not fit together; remove one.")
         known = list(keys_of(compose(others)))
         if key in known:  # a group that no line of this configuration names
             return ConfigError(

@@ -13,7 +13,7 @@ from pathlib import Path
 
 # Rank 0 tells the processes it starts where the run lies.
 ENVIRONMENT = "VPD_RUN_FOLDER"
-# What a job's place says already, or what does not change what comes out.
+# Keys that the folder's path gives already, or that do not change the results.
 _UNNAMED = ("sweep", "sweep_name", "experiment", "resume", "evaluate", "num_threads", "debug")
 _UNNAMED_SECTIONS = ("run.", "hydra.", "hydra/")
 _MAX_SLUG = 100
@@ -21,9 +21,9 @@ _MAX_SLUG = 100
 
 def choose_run_folder(folder: str | None, root: str, experiment: str, overrides: Sequence[str]) -> str:
     """Return the absolute folder of a run; one that does not exist yet, unless the caller named it."""
-    told = os.environ.get(ENVIRONMENT)
-    if told:
-        return told
+    named = os.environ.get(ENVIRONMENT)
+    if named:
+        return named
     if folder:
         return str(Path(folder).expanduser().absolute())
     digest = hashlib.sha256("\n".join(sorted(str(word) for word in overrides)).encode()).hexdigest()[:8]
@@ -50,16 +50,16 @@ def sweep_slug(overrides: Sequence[str], parameters: Sequence[str]) -> str:
         overrides: the words of the job.
         parameters: the keys that the sweep itself lists.
     """
-    told = {word.partition("=")[0]: word for word in sorted(overrides) if _is_named(word.partition("=")[0])}
-    keys = [key for key in parameters if key in told]
-    keys += [key for key in told if key not in keys]
+    given = {word.partition("=")[0]: word for word in sorted(overrides) if _is_named(word.partition("=")[0])}
+    keys = [key for key in parameters if key in given]
+    keys += [key for key in given if key not in keys]
     if not keys:
         return "default"
-    raw = "__".join("-".join(told[key].split("=", 1)) for key in keys)
+    raw = "__".join("-".join(given[key].split("=", 1)) for key in keys)
     slug = re.sub(r"[^\w.+-]+", "-", raw, flags=re.ASCII)
     if slug == raw and len(slug) <= _MAX_SLUG:
         return slug
-    digest = hashlib.sha256("\n".join(told[key] for key in keys).encode()).hexdigest()[:8]
+    digest = hashlib.sha256("\n".join(given[key] for key in keys).encode()).hexdigest()[:8]
     return f"{slug[:_MAX_SLUG].strip('-_')}_{digest}"
 
 

@@ -30,7 +30,7 @@ class SceneConfig:
     far: float = MISSING
     workspace_min: list[float] = MISSING
     workspace_max: list[float] = MISSING
-    # What our inertial dynamics knows beside; null in runs from before it did.
+    # Extra settings of our inertial dynamics; null in older runs.
     force_scale: float | None = None
     contact_range: float | None = None
     max_contact_depth: float | None = None

@@ -28,7 +28,7 @@ def keep_file(manifest: Manifest, name: str, write: Callable[[Path], object]) ->
 
 
 def _folders(manifest: Manifest) -> list[Path]:
-    """The data set's own folder; in the cache, data sets are told apart by what they hold."""
+    """The data set's own folder; in the cache, data sets are distinguished by their content."""
     root = os.environ.get("XDG_CACHE_HOME")
     try:
         cache = Path(root) if root else Path.home() / ".cache"

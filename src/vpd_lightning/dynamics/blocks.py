@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vpd_lightning.graph.hierarchical import EdgeSet
-from vpd_lightning.graph.incidence import Carrier, carried
+from vpd_lightning.graph.incidence import EdgeGather, gather_to_edges
 
 _ROWS_PER_CHUNK = 4096
 """Edges at a time on a CPU without gradients: 128 wide they fill 2 MiB, which stays in the cache of a core."""
@@ -89,7 +89,7 @@ class EdgeUpdater(nn.Module):
         received = None if receiver_nodes is None else functional.linear(receiver_nodes, node_weights[1])
         if self._is_chunked(edges):
             return self._updated_in_place(edges, weight, sent, received, edge_set)
-        hidden = carried(sent, edge_set.senders, received, edge_set.receivers)
+        hidden = gather_to_edges(sent, edge_set.senders, received, edge_set.receivers)
         return self._behind_nodes(edges, weight, hidden).add_(edges)
 
     def _behind_nodes(self, edges: Tensor, weight: Tensor, hidden: Tensor) -> Tensor:
@@ -109,10 +109,10 @@ class EdgeUpdater(nn.Module):
         self, edges: Tensor, weight: Tensor, sent: Tensor, received: Tensor | None, edge_set: EdgeSet
     ) -> Tensor:
         tables = [sent] if received is None else [sent, received]
-        carrier = Carrier(tables, [edge_set.senders.index, edge_set.receivers.index][: len(tables)])
+        gather = EdgeGather(tables, [edge_set.senders.index, edge_set.receivers.index][: len(tables)])
         for start in range(0, len(edges), _ROWS_PER_CHUNK):
             chunk = edges[start : start + _ROWS_PER_CHUNK]
-            chunk += self._behind_nodes(chunk, weight, carrier.rows(start, start + _ROWS_PER_CHUNK))
+            chunk += self._behind_nodes(chunk, weight, gather.rows(start, start + _ROWS_PER_CHUNK))
         return edges
 
 

@@ -17,7 +17,7 @@ from vpd_lightning.dynamics.blocks import MLP, EdgeUpdater, NodeUpdater
 from vpd_lightning.dynamics.delayed_faults import DelayedFaults
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.graph.hierarchical import EdgeSet, HierarchicalGraph, build_graph, draw_priorities
-from vpd_lightning.graph.incidence import carried
+from vpd_lightning.graph.incidence import gather_to_edges
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.graph.static_graph import build_static_graph
 from vpd_lightning.randomness import RandomKeys
@@ -249,7 +249,9 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         edges = {}
         for name, edge_set in edge_sets.items():
             sender_type, receiver_type = name.split("_to_")
-            relative = carried(positions[sender_type], edge_set.senders, -positions[receiver_type], edge_set.receivers)
+            relative = gather_to_edges(
+                positions[sender_type], edge_set.senders, -positions[receiver_type], edge_set.receivers
+            )
             edges[name] = self.encode_edge[name](relative)
 
         # Update particle -> abstract edges, then abstract nodes.

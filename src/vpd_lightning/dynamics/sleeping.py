@@ -58,7 +58,7 @@ class SleepingDynamics(AbstractDynamics):
     context, those asleep within ``context_radius`` of them; where it has abstract nodes, it takes so many fewer of them
     that they are as dense as in training. Context takes the change of features that the wrapped dynamics gives it (a
     shadow moves over a sleeping floor) unless ``freeze_features``; sleepers beyond keep their features. A dynamics with
-    a memory, which speaks of all particles, cannot be given a part of them: there a scene falls asleep as a whole, once
+    a memory, which describes all particles, cannot be given a part of them: there a scene falls asleep as a whole, once
     all particles that may move are at rest and supported. When all sleep, no step is made at all. Members of a batch
     sleep independently of each other; once one of them does, steps are made member by member.
 

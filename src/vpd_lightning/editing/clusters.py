@@ -33,10 +33,10 @@ _MIN_PLANE_WIDTH = 0.25
 def object_clusters(particles: Particles) -> Int64[Tensor, " particle"]:
     """Return the cluster of each particle of one frame (batch axis of 1), from 0 (most particles) on; -1 elsewhere.
 
-    Scenery and what hangs together with fewer than eight particles is -1. Where an encoder told what may move, all else
-    is scenery; where none did, the widest planes are. The others are divided into what convexly hangs together where
-    normals and colours were observed (``graph.bodies``), so that bodies which touch stay two; and else by DBSCAN
-    (scikit-learn) over places, to which bodies that touch are one.
+    Scenery and what hangs together with fewer than eight particles is -1. Where an encoder marked what may move, all
+    else is scenery; where none did, the widest planes are. The others are divided into what convexly hangs together
+    where normals and colours were observed (``graph.bodies``), so that bodies which touch stay two; and else by
+    DBSCAN (scikit-learn) over places, to which bodies that touch are one.
     """
     labels = torch.full((particles.num_particles,), -1, dtype=torch.int64)
     there = particles.mask[0].cpu()
@@ -45,13 +45,13 @@ def object_clusters(particles: Particles) -> Int64[Tensor, " particle"]:
         return labels.to(particles.positions.device)
     points = particles.positions[0].detach().cpu().double().numpy()[where]
     known = particles.moving
-    loose = ~_on_wide_planes(points) if known is None else known[0].cpu().numpy()[where]
+    dynamic_mask = ~_on_wide_planes(points) if known is None else known[0].cpu().numpy()[where]
     found = np.full(len(where), -1)
-    if loose.sum() >= _MIN_PARTICLES:
-        found[loose] = (
-            _divided(points[loose])
+    if dynamic_mask.sum() >= _MIN_PARTICLES:
+        found[dynamic_mask] = (
+            _divided(points[dynamic_mask])
             if particles.normals is None or particles.colors is None
-            else _bodies(particles, where[loose])
+            else _bodies(particles, where[dynamic_mask])
         )
     labels[torch.from_numpy(where)] = torch.from_numpy(_by_size(found))
     return labels.to(particles.positions.device)

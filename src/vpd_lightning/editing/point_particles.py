@@ -21,7 +21,7 @@ def particles_of_points(
     """Return particles at ``positions`` with the features of the particles of ``like`` (batch of 1) nearest in colour.
 
     Where ``like`` has normals, these come from the planes of near points, pointing away from the points' centre; where
-    it says what may move, the points may.
+    it marks what may move, the points may.
 
     Raises:
         EditError: there is no particle to take features from.

@@ -65,7 +65,7 @@ class SceneEditor:
 
     @property
     def state(self) -> EditState:
-        """The scene with what editing knows of it."""
+        """The scene with what editing stores about it."""
         return self._now.state
 
     @property

@@ -19,7 +19,7 @@ class DepthPredictingEncoder(UnprojectingEncoder):
     """One more output of the UNet is the z-depth of the pixel in metres, positive by the softplus that follows.
 
     ``channels`` lists the widths of the features, as for ``UNetEncoder``; the output for the depth comes on top of the
-    last one and is no feature. Particles lie where the predicted depth says, in training and in use; the measured depth
+    last one and is no feature. Particles lie at the predicted depth, in training and in use; the measured depth
     is never looked at. The prediction is offered as ``predicted_depth`` for a loss, and gets gradients from everything
     that looks at particle positions, too.
 

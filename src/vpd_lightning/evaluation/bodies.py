@@ -83,7 +83,7 @@ def _near_surface(
 ) -> tuple[NDArray[np.float64], SurfacePoints]:
     """Return the distance of every point to a surface, infinite beyond its box grown by ``margin``, and what is near.
 
-    The second speaks of the points with a finite distance only.
+    The second covers the points with a finite distance only.
     """
     low, high = corners.min(axis=(0, 1)) - margin, corners.max(axis=(0, 1)) + margin
     inside = ((points >= low) & (points <= high)).all(axis=1)

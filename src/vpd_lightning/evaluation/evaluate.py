@@ -36,7 +36,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Everything measured; the first axis of every array counts clips, ``trajectory`` says whose clip each one is.
+    """Everything measured; the first axis of every array counts clips, ``trajectory`` is the trajectory of each clip.
 
     ``images[system][metric]`` and ``native[metric]`` (at the system's own ``resolution``) are [clip, view, step],
     ``reconstruction[metric]`` [clip, view, 1], ``motion[metric]`` [clip, object, step], and ``blocks[metric][part]``
@@ -88,7 +88,7 @@ def evaluate(
     *,
     hide_depth: bool = False,
 ) -> Evaluation:
-    """Evaluate on the protocol's clips. ``progress`` hears what is being done, how much of it, and of how much.
+    """Evaluate on the protocol's clips. ``progress`` receives the task's name, how much is done, and of how much.
 
     ``hide_depth`` shows the system no depth (it is not measured anywhere), for systems that predict it.
 

@@ -37,7 +37,7 @@ def body_tracks(
 ) -> list[BodyTrack]:
     """Return every body's particles (``positions``, observed first) beside its true motion and what stands around it.
 
-    ``constants`` are the median displacements of the training set, the reference that knows no input.
+    ``constants`` are the median displacements of the training set, the reference without any input.
     """
     height = floor_height(clip)
     tracks = []

@@ -1,4 +1,4 @@
-"""What is solid around a body: ground truth says where that is, the model never sees it."""
+"""What is solid around a body: known from the ground truth, which the model never sees."""
 
 from collections.abc import Sequence
 

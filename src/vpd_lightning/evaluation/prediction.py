@@ -123,7 +123,7 @@ def predict_clip(system: PredictsVideo | PredictsViews, clip: Clip, input_views:
 
 
 def has_particles(scene: Scene) -> bool:
-    """Whether a state says where things are: a single particle carries a vector of the whole scene, and no place."""
+    """Whether a state has positions of its own: a single particle carries a vector of the whole scene, and no place."""
     return scene.current.num_particles > 1
 
 

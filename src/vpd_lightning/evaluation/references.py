@@ -43,7 +43,7 @@ def median_displacements(
     """Geometric median of each object's true displacement (metres) since the last input frame, in the training set.
 
     One entry per start frame. The score is a mean distance, so of all predictions of motion that do not depend on the
-    input this one has the smallest error on the training set: it knows the ground truth and is a reference, not a
+    input this one has the smallest error on the training set: it uses the ground truth and is a reference, not a
     model. A start frame is left out where no training trajectory has state that reaches far enough, or where they
     differ in their number of objects.
     """

@@ -1,4 +1,4 @@
-"""What an evaluation says: ``metrics.json``, ``metrics.csv``, ``arrays.npz`` and a compact table."""
+"""The results of an evaluation: ``metrics.json``, ``metrics.csv``, ``arrays.npz`` and a compact table."""
 
 import csv
 import json
@@ -130,7 +130,7 @@ def _ratio(error: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[s
 
 
 def _long_summary(rollouts: Sequence[LongRollout]) -> dict[str, Any] | None:
-    """Summarise over clips and objects; ``count`` says how many clips have values, for every object of theirs.
+    """Summarise over clips and objects; ``count`` is how many clips have values, for every object of theirs.
 
     A clip has none where its rollout is not finite, or where its particles hardly show the object.
     """
@@ -141,7 +141,7 @@ def _long_summary(rollouts: Sequence[LongRollout]) -> dict[str, Any] | None:
         return np.hstack([np.atleast_1d(getattr(rollout, name)) for rollout in rollouts]).astype(np.float64)
 
     def block(decides: str, **figures: tuple[str, Callable[[NDArray[np.float64]], Any]]) -> dict[str, Any]:
-        """All figures of a block speak about the same clips and objects: those whose ``decides`` is a number."""
+        """All figures of a block are over the same clips and objects: those whose ``decides`` is a number."""
         known = np.isfinite(values(decides))
         count = sum(bool(np.isfinite(getattr(rollout, decides)).all()) for rollout in rollouts)
         picked = {name: plain(pick(values(of)[known])) if known.any() else None for name, (of, pick) in figures.items()}

@@ -1,4 +1,4 @@
-"""Whether what is evaluated was trained on: trajectories are told by what they hold, whatever their name or split."""
+"""Whether what is evaluated was trained on: trajectories are compared by content, whatever their name or split."""
 
 from collections.abc import Collection
 from typing import Any

@@ -154,7 +154,7 @@ def _long_lines(rollout: Mapping[str, Any]) -> list[str]:
 
 
 def _share(block: Mapping[str, Any], num_clips: int) -> str:
-    """Say over how many clips a block speaks, where that is not all."""
+    """Say how many clips a block averages over, where that is not all."""
     return "" if block["count"] == num_clips else f" ({block['count']} of {num_clips} clips)"
 
 

@@ -11,7 +11,7 @@ from vpd_lightning.types import Cameras
 def depth_normals(
     depth: Float[Tensor, "*shape height width"], cameras: Cameras
 ) -> Float[Tensor, "*shape height width 3"]:
-    """Return unit normals towards the camera; zero where they cannot be told (image border, missing depth).
+    """Return unit normals towards the camera; zero where they are undefined (image border, missing depth).
 
     Each image axis uses whichever one-sided difference crosses the smaller depth step, so that a normal beside an
     occlusion edge belongs to its own surface.

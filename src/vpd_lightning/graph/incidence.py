@@ -1,4 +1,4 @@
-"""Which node each edge touches: rows are carried from nodes to edges, and edges are summed at nodes.
+"""Which node each edge touches: node features are gathered to edges, and edges are summed at nodes.
 
 The two are adjoint, so each one's gradient is the other: both directions are gathers and sums over sorted lists, which
 repeat bit for bit with any number of threads and on every device. Nothing here is an atomic scatter.
@@ -49,7 +49,7 @@ class Incidence:
         return _Sum.apply(edges, self.index, self.num_nodes, self.order, self.offsets, self.width)
 
 
-def carried(
+def gather_to_edges(
     rows: Float[Tensor, "node feature"],
     incidence: Incidence,
     more: Float[Tensor, "other_node feature"] | None = None,
@@ -58,13 +58,13 @@ def carried(
     """Return for each edge the row of its node, plus the row of the node at its other end where one is given."""
     one = (incidence.index, incidence.order, incidence.offsets, incidence.width)
     if more is None or more_incidence is None:
-        return _Carry.apply(rows, None, *one, None, None, None, None)
+        return _Gather.apply(rows, None, *one, None, None, None, None)
     other = (more_incidence.index, more_incidence.order, more_incidence.offsets, more_incidence.width)
-    return _Carry.apply(rows, more, *one, *other)
+    return _Gather.apply(rows, more, *one, *other)
 
 
-class Carrier:
-    """``carried`` for some of the edges at a time, without gradients: what they read is laid out once."""
+class EdgeGather:
+    """``gather_to_edges`` for some of the edges at a time, without gradients: what they read is laid out once."""
 
     def __init__(self, tables: list[Float[Tensor, "_ feature"]], indices: list[Int64[Tensor, " edge"]]) -> None:
         # Padding reads the zeros behind each table.
@@ -87,14 +87,14 @@ class Carrier:
         return first + others[0] if others else first
 
 
-class _Carry(torch.autograd.Function):
+class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rows, more, index, order, offsets, width, more_index, more_order, more_offsets, more_width):  # type: ignore[no-untyped-def]
         ctx.save_for_backward(index, order, offsets, more_index, more_order, more_offsets)
         ctx.sizes = len(rows), width, None if more is None else len(more), more_width
         if more is None:
-            return Carrier([rows], [index]).rows()
-        return Carrier([rows, more], [index, more_index]).rows()
+            return EdgeGather([rows], [index]).rows()
+        return EdgeGather([rows, more], [index, more_index]).rows()
 
     @staticmethod
     def backward(ctx, gradient):  # type: ignore[no-untyped-def]
@@ -117,7 +117,7 @@ class _Sum(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):  # type: ignore[no-untyped-def]
         (index,) = ctx.saved_tensors
-        return Carrier([gradient], [index]).rows(), None, None, None, None, None
+        return EdgeGather([gradient], [index]).rows(), None, None, None, None, None
 
 
 def _sums(

@@ -12,7 +12,7 @@ class PointFeatureLoss(AbstractLoss):
     """Mean squared difference of the features at the same points under predicted and under encoded particles.
 
     Averaged over steps, points and features; needs no correspondences between the two sets of particles. Most points of
-    a workspace are empty, which makes that number tiny, so ``point_features_near`` says how large it is at the points
+    a workspace are empty, which makes that number tiny, so ``point_features_near`` reports its size at the points
     whose ``point_mass`` (sum of the narrowest kernel over the encoded particles) is above ``min_mass``.
     """
 

@@ -50,11 +50,11 @@ def write_maps(
     with AtomicPath(path) as partial, partial.open("wb") as stream:
         np.savez_compressed(stream, **arrays)
     if num_frames > 1:
-        for kind, (pictures, says) in map_pictures(maps, opacity).items():
+        for kind, (pictures, caption) in map_pictures(maps, opacity).items():
             labelled = []
             for picture in pictures:
                 large = enlarge(picture)
-                labelled.append(np.concatenate([label_bar(says, large.shape[1]), large]))
+                labelled.append(np.concatenate([label_bar(caption, large.shape[1]), large]))
             write_video(folder / f"{name}_{kind}.webm", np.stack(labelled), frames_per_second)
 
 

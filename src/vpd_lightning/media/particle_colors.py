@@ -1,4 +1,4 @@
-"""What colour is a particle? The renderer says."""
+"""The colour of each particle, rendered from nearby."""
 
 import torch
 from jaxtyping import Float

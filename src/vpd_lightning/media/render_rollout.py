@@ -1,4 +1,4 @@
-"""Roll one recording out and film it from chosen cameras; keep the particles, coloured by the renderer."""
+"""Roll one recording out and render it from chosen cameras; keep the particles, coloured by the renderer."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +30,7 @@ _MAX_SHEET_VIEWS = 8
 
 
 @dataclass(frozen=True)
-class Film:
+class RenderedRollout:
     """What the cameras saw: colours, z-depth in metres (0 where it is no number) and opacity in [0, 1].
 
     The axis ``camera`` has length 1 for a moving camera.
@@ -46,7 +46,7 @@ class Film:
 
 
 def predict(simulator: Simulator, scene: Scene, num_steps: int, freeze_step: int | None) -> dict[int, Particles]:
-    """Roll out, and return the states to film by their steps; step 0 is the last input frame.
+    """Roll out, and return the states to render by their steps; step 0 is the last input frame.
 
     With ``freeze_step`` that is one state, so many steps after the last input frame.
     """
@@ -55,12 +55,12 @@ def predict(simulator: Simulator, scene: Scene, num_steps: int, freeze_step: int
     return states if freeze_step is None else {freeze_step: states[freeze_step]}
 
 
-def film(
+def render_rollout(
     simulator: Simulator,
     states: Sequence[Particles],
     viewpoints: Viewpoints,
     progress: Callable[[str, int, int], None],
-) -> Film:
+) -> RenderedRollout:
     """Render the states; a moving camera has one place for each, or, where there is only one state, shows that one.
 
     Raises:
@@ -68,28 +68,28 @@ def film(
     """
     cameras = viewpoints.cameras
     if not viewpoints.moving:
-        shots = [(state, cameras) for state in states]
+        views = [(state, cameras) for state in states]
     else:
         seen = list(states) * cameras.shape[0] if len(states) == 1 else states
-        shots = [
+        views = [
             (state, cameras[place : place + 1]) for place, state in zip(range(cameras.shape[0]), seen, strict=True)
         ]
     frames: dict[str, list[Tensor]] = {"rgb": [], "depth": [], "opacity": []}
-    for number, (state, there) in enumerate(shots):
-        progress("frames", number, len(shots))
+    for number, (state, there) in enumerate(views):
+        progress("frames", number, len(views))
         seen_maps = simulator.render_maps([state], there)
         colors = seen_maps.rgbs[0].float().nan_to_num(0.0).clamp(0, 1)
         depth = z_depth(seen_maps.depths[0].float().cpu(), there.to("cpu"))
         frames["rgb"].append((colors * 255).round().to(torch.uint8).cpu())
         frames["depth"].append(depth.nan_to_num(0.0, posinf=0.0, neginf=0.0))
         frames["opacity"].append(seen_maps.opacities[0].float().nan_to_num(0.0).clamp(0, 1).cpu())
-    return Film(**{name: torch.stack(parts) for name, parts in frames.items()})
+    return RenderedRollout(**{name: torch.stack(parts) for name, parts in frames.items()})
 
 
-def write_films(
+def write_videos(
     folder: Path,
     viewpoints: Viewpoints,
-    filmed: Film,
+    rendered: RenderedRollout,
     truth: NDArray[np.uint8] | None,
     fps: float,
     save_maps: Sequence[str],
@@ -98,15 +98,15 @@ def write_films(
 
     ``truth`` is (time, camera, height, width, 3). A single frame makes a picture, and no film.
     """
-    frames = filmed.rgb.numpy()
+    frames = rendered.rgb.numpy()
     for number, name in enumerate(viewpoints.names):
         if len(frames) > 1:
             write_video(folder / f"{name}.webm", np.stack([enlarge(image) for image in frames[:, number]]), fps)
         write_png(folder / f"{name}.png", enlarge(frames[len(frames) // 2, number]))
         if save_maps:
             cameras = viewpoints.cameras if viewpoints.moving else viewpoints.cameras[number]
-            opacity = filmed.opacity[:, number].numpy()
-            write_maps(folder, name, filmed.maps(save_maps, number), opacity, cameras, fps)
+            opacity = rendered.opacity[:, number].numpy()
+            write_maps(folder, name, rendered.maps(save_maps, number), opacity, cameras, fps)
     if truth is None or len(frames) == 1:
         return
     labels = [f"step {step}" for step in range(len(frames))]
@@ -120,7 +120,7 @@ def write_films(
 def write_moment_sheet(
     folder: Path,
     viewpoints: Viewpoints,
-    filmed: Film,
+    rendered: RenderedRollout,
     truth: NDArray[np.uint8] | None,
     step: int,
     save_maps: Sequence[str],
@@ -130,18 +130,18 @@ def write_moment_sheet(
     ``truth`` is (time=1, camera, height, width, 3), and only there for cameras of the recording.
     """
     axis = 1 if viewpoints.moving else 0  # what has length 1: the cameras, or the moments
-    images = filmed.rgb.select(axis, 0).numpy()
+    images = rendered.rgb.select(axis, 0).numpy()
     picked = _places(len(images), viewpoints.is_cycle)
     lines: dict[str, NDArray[np.uint8]] = {"prediction": images[picked]}
     if truth is not None:
         shown = truth[0][picked]
         lines = {"truth": shown, **lines, "error": error_image(lines["prediction"], shown)}
-    maps = {name: getattr(filmed, name).select(axis, 0).numpy()[picked] for name in save_maps}
+    maps = {name: getattr(rendered, name).select(axis, 0).numpy()[picked] for name in save_maps}
     notes = []
-    opacity = filmed.opacity.select(axis, 0).numpy()[picked]
-    for kind, (pictures, says) in map_pictures(maps, opacity).items():
+    opacity = rendered.opacity.select(axis, 0).numpy()[picked]
+    for kind, (pictures, caption) in map_pictures(maps, opacity).items():
         lines[kind] = pictures
-        notes.append(says)
+        notes.append(caption)
     title = "; ".join([f"step {step}", *notes])
     write_view_sheet(folder / "contact_sheet.png", lines, [viewpoints.labels[i] for i in picked], title)
 
@@ -190,6 +190,6 @@ def read_context(path: Path, start: int) -> Clip:
 
 
 def write_description(path: Path, content: Mapping[str, Any]) -> None:
-    """Write what was filmed as JSON."""
+    """Write what was rendered as JSON."""
     with AtomicPath(path) as partial:
         partial.write_text(json.dumps(content, indent=1) + "\n")

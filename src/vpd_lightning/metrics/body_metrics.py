@@ -26,7 +26,7 @@ def centroid_error_copy(track: BodyTrack) -> Steps:
 
 
 def centroid_error_constant(track: BodyTrack) -> Steps:
-    """The centroid error of the training set's median displacement, the reference that knows no input."""
+    """The centroid error of the training set's median displacement, the reference without any input."""
     if track.constant is None:
         return track.unknown()
     num_known = min(track.num_true, track.constant.shape[0])

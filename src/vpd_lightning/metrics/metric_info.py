@@ -29,7 +29,7 @@ class MetricInfo:
     A metric is shown wherever it exists, unless ``in_tables`` (comparisons of systems) or ``in_summary`` say otherwise.
     ``needs_motion``: it counts moving pixels only. ``has_extremes``: its smallest and largest value are kept, too.
     ``reference_of`` names the metric of which this one is the value of a prediction that needs no model;
-    ``sees_input`` says whether that prediction looks at the input.
+    ``sees_input`` is whether that prediction uses the input.
     """
 
     name: str

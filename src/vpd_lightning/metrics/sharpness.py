@@ -24,7 +24,7 @@ def sharpness(
 ) -> Float[Tensor, "..."]:
     """Mean gradient magnitude of each prediction (clamped to [0, 1]) over that of its truth: below 1 is blurred.
 
-    Bounded to 10. Noise and wrong edges raise it, so it says nothing without an error beside it; where most of a
+    Bounded to 10. Noise and wrong edges raise it, so it means nothing without an error beside it; where most of a
     picture does not move, the background dominates it. Two images of one colour are equally
     sharp (1); a truth of one colour is no measure for a prediction that has structure (NaN).
     """

@@ -87,7 +87,7 @@ def _usage_lines(content: CardContent) -> list[str]:
 
 
 def protocol_words(of_run: Mapping[str, Any], measured: Mapping[str, Any]) -> list[str]:
-    """Return what ``vpd-eval`` must be told to measure as the figures were, where the run's own protocol is another."""
+    """Return the options with which ``vpd-eval`` gives the figures, where the run's own protocol is another."""
     # The number of trajectories in the figures is how many there were, not how many were asked for.
     keys = [key for key in of_run if key in measured and key != "num_trajectories"]
     return [f"protocol.{key}={measured[key]}".replace(" ", "") for key in keys if measured[key] != of_run[key]]

@@ -17,7 +17,7 @@ SYSTEM_CARDS = {
     "slotformer": SystemCard(
         note=(
             "SlotFormer (Wu et al., ICLR 2023) on slots of SAVi (Kipf et al., ICLR 2022): pictures become slots, a "
-            "transformer predicts the next slots, and a decoder draws them. It reads no depth and knows no "
+            "transformer predicts the next slots, and a decoder draws them. It reads no depth and has no "
             "cameras: it predicts each camera's video from that camera's own frames, and cannot render a new view."
         ),
         color="#d55e00",

@@ -13,7 +13,13 @@ from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.field.positional_encoding import encoding_dim, positional_encoding
 from vpd_lightning.renderer.field.precision import at_least_float32, full_precision
 from vpd_lightning.renderer.field.radiance_field import RadianceField
-from vpd_lightning.renderer.rays.chunked_rays import automatic_chunk_size, joined, ray_slices, recomputed, uniform_draws
+from vpd_lightning.renderer.rays.chunked_rays import (
+    automatic_chunk_size,
+    checkpointed,
+    joined,
+    ray_slices,
+    uniform_draws,
+)
 from vpd_lightning.renderer.rays.hierarchical_sampling import (
     closed_color,
     coarse_samples,
@@ -163,7 +169,7 @@ class GlobalNeRFRenderer(AbstractRenderer):
         def network(points: Tensor, scenes: Tensor) -> tuple[Tensor, Tensor | None]:
             return field(self._encoded(points), directions, use_color, scenes)
 
-        return recomputed(network, points, scenes, is_enabled=self.checkpoint_chunks)
+        return checkpointed(network, points, scenes, is_enabled=self.checkpoint_chunks)
 
     def _encoded(self, points: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape encoding"]:
         with full_precision(points):

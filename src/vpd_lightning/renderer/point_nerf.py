@@ -17,7 +17,13 @@ from vpd_lightning.renderer.features.sample_features import SampleFeatures
 from vpd_lightning.renderer.field.precision import at_least_float32
 from vpd_lightning.renderer.field.radiance_field import RadianceField
 from vpd_lightning.renderer.kernels.fused_features import FEATURE_BACKENDS
-from vpd_lightning.renderer.rays.chunked_rays import automatic_chunk_size, joined, ray_slices, recomputed, uniform_draws
+from vpd_lightning.renderer.rays.chunked_rays import (
+    automatic_chunk_size,
+    checkpointed,
+    joined,
+    ray_slices,
+    uniform_draws,
+)
 from vpd_lightning.renderer.rays.hierarchical_sampling import (
     closed_color,
     coarse_samples,
@@ -33,7 +39,7 @@ from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 class PointNeRFRenderer(AbstractRenderer):
     """Renders rays as the paper's appendix (VPD implementation details, Renderer) and jaxnerf do.
 
-    A coarse tier of ``num_coarse_samples`` stratified samples without view directions says where light is stopped;
+    A coarse tier of ``num_coarse_samples`` stratified samples without view directions locates where light is stopped;
     the fine tier looks at the same samples and ``num_fine_samples`` more, drawn where the coarse weights are, with
     view directions. The coarse samples' neighbours and features are used again by the fine tier.
 
@@ -47,7 +53,7 @@ class PointNeRFRenderer(AbstractRenderer):
     and the features of each sample (64 numbers) are kept, the networks' activations are not.
 
     ``kernel_normalization``, ``normalization_epsilon`` and ``feature_network`` make the features others than the
-    paper's main model has them, see ``NeighborFeatures``. ``bounds`` does not speak of those.
+    paper's main model has them, see ``NeighborFeatures``. Error ``bounds`` exclude these.
 
     Exact, up to the order of summation: ``sort_particles`` (along a Morton curve, for the cache; equally distant
     particles may change places), ``reuse_coarse`` (the fine tier does not compute the coarse samples' neighbours and
@@ -115,7 +121,7 @@ class PointNeRFRenderer(AbstractRenderer):
         if not self.variant.is_plain and features_backend not in ("auto", "torch"):
             raise ValueError(
                 f"features_backend must be auto or torch with kernel_normalization or feature_network: "
-                f"{features_backend} knows the plain features only."
+                f"{features_backend} supports the plain features only."
             )
         self.num_neighbors = num_neighbors
         self.kernel_radii = tuple(float(radius) for radius in kernel_radii)
@@ -184,7 +190,7 @@ class PointNeRFRenderer(AbstractRenderer):
         return joined(parts)
 
     def render_at(self, particles: Particles, rays: Rays, t: Float[Tensor, "batch ray sample"]) -> RenderedRays:
-        """Render with the fine tier alone at given ascending distances (metres); ``bounds`` speaks of this."""
+        """Render with the fine tier alone at given ascending distances (metres); the error ``bounds`` refer to this."""
         features = self._sample_features(particles)
         origins, directions = at_least_float32(rays.origins), at_least_float32(rays.directions)
         return self._composited(*self._fine_tier(features, origins, directions, t), t)
@@ -253,13 +259,13 @@ class PointNeRFRenderer(AbstractRenderer):
         directions: Float[Tensor, "*batch 3"] | None,
         use_color: bool = True,
     ) -> tuple[Tensor, Any]:
-        """Return what a network says of samples; several parts of ``features`` are joined along the samples."""
+        """Return a network's output at samples; several parts of ``features`` are joined along the samples."""
         parts = features if isinstance(features, tuple) else (features,)
 
         def network(*parts: Tensor) -> tuple[Tensor, Tensor | None]:
             return field(torch.cat(parts, dim=-2) if len(parts) > 1 else parts[0], directions, use_color)
 
-        return recomputed(network, *parts, is_enabled=self.checkpoint_chunks)
+        return checkpointed(network, *parts, is_enabled=self.checkpoint_chunks)
 
     def _sample_features(self, particles: Particles) -> SampleFeatures:
         return SampleFeatures(
@@ -271,6 +277,6 @@ class PointNeRFRenderer(AbstractRenderer):
             neighbors_backend=self.neighbors_backend,
             features_backend=self.features_backend,
             is_sorted=self.sort_particles,
-            is_recomputed=self.checkpoint_chunks,
+            is_checkpointed=self.checkpoint_chunks,
             variant=self.variant,
         )

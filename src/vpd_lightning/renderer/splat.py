@@ -24,9 +24,9 @@ class SplatRenderer(AbstractRenderer):
     front layer and a back layer by their distance along the ray. Each layer gives the network its mean features under
     Gaussian kernels of ``kernel_scales``, the mean offset from the ray (whether the ray passes beside a silhouette),
     and its density. The network returns two colours and two opacities; a background of the view direction closes the
-    ray. With ``color_features`` the first three features of a particle are its colour, and the network says how a layer
-    differs from their mean under the first kernel. A ray with no particle in front of its camera shows the background
-    alone.
+    ray. With ``color_features`` the first three features of a particle are its colour, and the network predicts how a
+    layer differs from their mean under the first kernel. A ray with no particle in front of its camera shows the
+    background alone.
 
     ``surface_scale`` is in metres: about as far as a surface reaches beside and behind a particle on it.
     ``kernel_scales`` (widths beside the ray) and ``layer_depth`` (along it) are multiples of it.

@@ -17,7 +17,7 @@ from vpd_lightning.renderer.field.positional_encoding import encoding_dim, posit
 from vpd_lightning.renderer.field.precision import at_least_float32, full_precision
 from vpd_lightning.renderer.field.radiance_field import RadianceField
 from vpd_lightning.renderer.kernels.ray_search import Candidates, check_backend
-from vpd_lightning.renderer.rays.chunked_rays import joined, ray_slices, recomputed, uniform_draws
+from vpd_lightning.renderer.rays.chunked_rays import checkpointed, joined, ray_slices, uniform_draws
 from vpd_lightning.renderer.rays.ray_candidates import (
     CandidateTable,
     RayCandidates,
@@ -168,7 +168,7 @@ class SurfaceRenderer(AbstractRenderer):
             neighbors_backend="auto",
             features_backend="auto",
             is_sorted=True,
-            is_recomputed=self.checkpoint_chunks,
+            is_checkpointed=self.checkpoint_chunks,
             variant=self.variant,
         )
         return features(queries[:, :, None])[:, :, 0]
@@ -187,7 +187,7 @@ class SurfaceRenderer(AbstractRenderer):
             return self.field(features, directions)
 
         parts = candidates.along, candidates.across, candidates.features, candidates.offsets
-        sigmas, rgbs = recomputed(seen, *parts, is_enabled=self.checkpoint_chunks)
+        sigmas, rgbs = checkpointed(seen, *parts, is_enabled=self.checkpoint_chunks)
         t_starts, t_ends = self._intervals(t)
         rgb, weights, transmittance = composite(sigmas / self.footprint, rgbs, t_starts, t_ends)
         with full_precision(t):

@@ -39,7 +39,7 @@ def resumed_overrides(overrides: Sequence[str]) -> list[str]:
     if not has_checkpoint(folder):
         raise CheckpointError(
             f"there is nothing to resume in {folder}.\nIt holds no checkpoints/last.ckpt.\n"
-            "Name the folder of a run (resume=runs/EXPERIMENT/RUN), or leave resume away to start anew."
+            "Name the folder of a run (resume=runs/EXPERIMENT/RUN), or remove resume to start anew."
         )
     merged = _as_mapping([*_saved_overrides(folder), *overrides])
     merged["resume"] = merged["run.folder"] = quote(str(folder.absolute()))
@@ -80,7 +80,7 @@ def _youngest_run(root: Path, experiment: str | None) -> Path:
         of = f" of experiment {experiment}" if experiment else ""
         raise CheckpointError(
             f"there is nothing to resume in {root.absolute()}.\nNo run{of} there has saved a checkpoint.\n"
-            "Leave resume=last away to start a run, or name the folder of one: resume=FOLDER"
+            "Remove resume=last to start a run, or name the folder of one: resume=FOLDER"
         )
     return max(runs, key=lambda run: last_saved(run) or 0.0)
 

@@ -14,7 +14,7 @@ from vpd_lightning.runs.run_claim import is_claimed, lock
 
 DONE, SKIPPED, RESUMED, FAILED, TAKEN = "done", "skipped", "resumed", "failed", "taken by another process"
 FINISHED = "finished"
-"""File that says of a job's run folder that nothing is left to do there."""
+"""File that marks a job's run folder as done."""
 _LOCKS = ".jobs"
 
 
@@ -123,7 +123,7 @@ def _attend_to(job: SweepJob, number: str, train: Callable[[list[str]], None]) -
 
 
 def _settled(config: dict[str, Any]) -> list[str]:
-    """Say what the folder's name does not, lest a run that goes on keeps what it was told when it began."""
+    """Say what the folder's name does not, so that a resumed run does not keep the options it began with."""
     values = {key: config[key] for key in ("evaluate", "num_threads")}
     return [f"{key}={'null' if value is None else str(value).lower()}" for key, value in values.items()]
 
@@ -150,7 +150,7 @@ def _refuse_words(overrides: Sequence[str]) -> None:
     if "run.folder" in keys:
         raise ConfigError("run.folder names one folder, but a sweep makes many.\nUse run.root=FOLDER.")
     if "resume" in keys:
-        raise ConfigError("a named sweep goes on by itself.\nLeave resume away.")
+        raise ConfigError("a named sweep goes on by itself.\nRemove resume.")
     if launcher := next((word for word in overrides if word.startswith(("hydra/launcher=", "hydra.launcher"))), ""):
         raise ConfigError(
             f"'{launcher}' does not serve a named sweep, whose jobs run one after the other.\n"

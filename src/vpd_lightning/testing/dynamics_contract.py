@@ -33,7 +33,7 @@ class DynamicsContract(Contract):
 
     Build it for features of ``feature_dim`` numbers and a scene of a metre: a ball 30 cm wide that moves 4 cm per
     step over a floor (``ball_particles``). Every particle carries colours, normals and whether it may move;
-    ``needs_observations`` says that the dynamics cannot do without them.
+    ``needs_observations``: the dynamics cannot do without them.
     """
 
     feature_dim: int = FEATURE_DIM

@@ -11,7 +11,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 
 class AbstractOptimization(ABC):
-    """Adam with one learning rate per stage, all multiplied by ``share_at(step)``."""
+    """Adam with one learning rate per stage, all multiplied by ``lr_factor(step)``."""
 
     def __init__(
         self, *, lr: float, betas: Sequence[float], eps: float, stage_multipliers: Mapping[str, float]
@@ -26,7 +26,7 @@ class AbstractOptimization(ABC):
         self.stage_multipliers = dict(stage_multipliers)
 
     @abstractmethod
-    def share_at(self, step: int, max_steps: int) -> float:
+    def lr_factor(self, step: int, max_steps: int) -> float:
         """Return the factor on all learning rates for the update that follows ``step`` updates."""
 
     def build(self, simulator: nn.Module, max_steps: int | Callable[[], int]) -> tuple[torch.optim.Adam, LambdaLR]:
@@ -54,7 +54,7 @@ class AbstractOptimization(ABC):
         optimizer = torch.optim.Adam(groups, betas=self.betas, eps=self.eps)
         # A plain function: a scheduler writes the attributes of other callables into the checkpoint.
         expected = max_steps if callable(max_steps) else lambda: max_steps
-        return optimizer, LambdaLR(optimizer, lambda step: self.share_at(step, expected()))
+        return optimizer, LambdaLR(optimizer, lambda step: self.lr_factor(step, expected()))
 
 
 class StepDecayAdam(AbstractOptimization):
@@ -71,7 +71,7 @@ class StepDecayAdam(AbstractOptimization):
             raise ValueError(f"gamma must be above 0 and milestones at least 1, got {gamma} and {list(milestones)}")
         self.milestones, self.gamma = sorted(milestones), gamma
 
-    def share_at(self, step: int, max_steps: int) -> float:
+    def lr_factor(self, step: int, max_steps: int) -> float:
         """Return gamma to the power of the milestones passed."""
         return self.gamma ** sum(step >= milestone for milestone in self.milestones)
 
@@ -99,7 +99,7 @@ class WarmupCosineAdam(AbstractOptimization):
             )
         self.warmup_steps, self.final_share = warmup_steps, final_share
 
-    def share_at(self, step: int, max_steps: int) -> float:
+    def lr_factor(self, step: int, max_steps: int) -> float:
         """Return min(1, (step + 1) / warm-up) times the cosine from 1 to ``final_share``."""
         warm_up = min(1.0, (step + 1) / self.warmup_steps) if self.warmup_steps else 1.0
         done = min(1.0, max(0.0, (step - self.warmup_steps) / max(1, max_steps - self.warmup_steps)))

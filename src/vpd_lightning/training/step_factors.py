@@ -33,7 +33,7 @@ class StepFactorsAdam(AbstractOptimization):
             raise ValueError(f"factors must be finite and above 0, got {list(factors)}")
         self.milestones, self.factors = list(milestones), list(factors)
 
-    def share_at(self, step: int, max_steps: int) -> float:
+    def lr_factor(self, step: int, max_steps: int) -> float:
         """Return the product of the factors of all milestones passed."""
         passed = [
             factor for share, factor in zip(self.milestones, self.factors, strict=True) if step >= share * max_steps

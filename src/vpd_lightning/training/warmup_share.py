@@ -30,7 +30,7 @@ class WarmupShareCosineAdam(AbstractOptimization):
             )
         self.warmup_share, self.end_share = warmup_share, end_share
 
-    def share_at(self, step: int, max_steps: int) -> float:
+    def lr_factor(self, step: int, max_steps: int) -> float:
         """Return ``end_share`` at step 0, 1 at the end of the warm-up and ``end_share`` again at ``max_steps``."""
         warmup_steps = self.warmup_share * max_steps
         if step < warmup_steps:

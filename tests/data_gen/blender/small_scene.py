@@ -1,4 +1,4 @@
-"""A small MuJoCo scene with one of everything that Blender is told to draw, and what is needed to render it."""
+"""A small MuJoCo scene with one of everything that the Blender export supports, and what is needed to render it."""
 
 from typing import Any
 

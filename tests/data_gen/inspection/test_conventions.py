@@ -9,7 +9,7 @@ import pytest
 from data_gen.inspection.fault import Fault
 from data_gen.inspection.validate import check_dataset, convention_errors, validate_dataset
 from tests.data.analytic_scene import known_trajectory
-from tests.data.mistakes import (
+from tests.data_gen.inspection.mistakes import (
     Change,
     as_distance,
     chain,
@@ -121,7 +121,7 @@ def test_correct_data_of_many_scenes_have_no_fault(tmp_path: Path, sensor: str):
         assert [fault for fault in faults if fault.is_error] == [], seed
 
 
-def test_exact_views_agree_to_rounding_and_wrong_readings_do_not(tmp_path: Path):
+def test_exact_views_agree_to_rounding_and_wrong_conventions_do_not(tmp_path: Path):
     write_trajectory(tmp_path / "a.h5", known_trajectory(seed=4))
     errors = convention_errors(tmp_path / "a.h5")
 

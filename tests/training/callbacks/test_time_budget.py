@@ -102,7 +102,7 @@ def test_pace_is_that_of_the_steps_behind_the_first_ones_of_a_start(data: Path, 
 
 def test_several_devices_follow_the_clock_of_the_first() -> None:
     class Strategy:
-        """The first device says what the others hear."""
+        """The first device's time is broadcast to the others."""
 
         def __init__(self) -> None:
             self.said: Any = None

@@ -17,7 +17,7 @@ import numpy as np
 
 from vpd_lightning.data.busy import busy_error
 from vpd_lightning.data.hdf5.broken_file import BrokenFileError, brief, refuse
-from vpd_lightning.data.hdf5.text_heaps import are_heaps_sound
+from vpd_lightning.data.hdf5.text_heaps import global_heaps_valid
 from vpd_lightning.errors import DataError
 
 MAX_DATASET_BYTES = 64 * 2**30
@@ -101,7 +101,7 @@ def open_file(path: Path) -> h5py.File:
         with named_damage(path):
             if file.userblock_size:
                 raise refuse(path, "user_block", f"starts with {file.userblock_size} bytes that are not HDF5")
-            if not are_heaps_sound(path):
+            if not global_heaps_valid(path):
                 raise refuse(path, "damaged_file", "is damaged (where its texts are kept)", _COPY_AGAIN)
             check_links(path, file)
     except BaseException:

@@ -129,8 +129,8 @@ def read_whole(path: Path, dataset: h5py.Dataset) -> NDArray[Any]:
 def lzf_size(packed: bytes) -> int:
     """Return how many bytes a chunk of HDF5's lzf unpacks to, without unpacking it.
 
-    A control byte below 32 says that so many bytes and one follow as they are. Of any other, the upper three bits plus
-    2 are the length of a copy (of 7, the next byte is added); the last byte of it says from where.
+    A control byte below 32 means that so many bytes and one follow as they are. Of any other, the upper three bits plus
+    2 are the length of a copy (of 7, the next byte is added); the last byte of it gives the distance.
 
     Raises:
         ValueError: it ends in the middle of a step.

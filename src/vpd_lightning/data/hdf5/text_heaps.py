@@ -9,7 +9,7 @@ _SEARCHED = 2**20  # bytes from the start of the file; writers put attributes th
 _MIN_BYTES, _MAX_BYTES = 64, 2**24
 
 
-def are_heaps_sound(path: Path) -> bool:
+def global_heaps_valid(path: Path) -> bool:
     """Whether every global heap at the start of the file is filled exactly by its objects (no checksum covers them)."""
     with path.open("rb") as stream:
         content = stream.read(_SEARCHED + _MIN_BYTES)

@@ -1,4 +1,4 @@
-"""Codes of whole videos on disk: one array of all frames, and an index that says whose they are."""
+"""Codes of whole videos on disk: one array of all frames, and an index of which video each belongs to."""
 
 import json
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class StoredVideo:
 class SlotStore:
     """Slots of the videos of a data set, read frame by frame; opened in each process at its first use.
 
-    ``slots.npy`` holds float32 (frame, slot, dim), the videos one after another; ``slots.json`` says which rows belong
+    ``slots.npy`` holds float32 (frame, slot, dim), the videos one after another; ``slots.json`` lists which rows belong
     to which (trajectory file, camera), and ``SlotSource``. The index is written last: without it there is no store.
 
     Raises:

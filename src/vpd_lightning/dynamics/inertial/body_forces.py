@@ -82,17 +82,17 @@ class BodyForces(nn.Module):
         distance = relative.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
         count = body.shape[1]
         there = (weights.sum(dim=-1) > 0).to(body.dtype)
-        heard = self._heard(distance, there)
+        pair_weights = self._pair_weights(distance, there)
         for message, update in zip(self.messages, self.updates, strict=True):
             pair = [body[:, :, None].expand(-1, -1, count, -1), body[:, None].expand(-1, count, -1, -1)]
-            received = (message(torch.cat([*pair, relative, distance], dim=-1)) * heard).sum(dim=2)
+            received = (message(torch.cat([*pair, relative, distance], dim=-1)) * pair_weights).sum(dim=2)
             body = body + update(torch.cat([body, received], dim=-1))
         return self._push(positions, share, probe, body, there, motion, inertia)
 
-    def _heard(
+    def _pair_weights(
         self, distances: Float[Tensor, "batch body body 1"], there: Float[Tensor, "batch body"]
     ) -> Float[Tensor, "batch body body 1"]:
-        """Return what each body hears of each, itself most: less with distance, nothing beyond the contact range.
+        """Return attention weights between bodies, largest to itself, falling to zero at ``contact_range``.
 
         So a body that is alone moves as one whose neighbours are far away, which training shows.
         """

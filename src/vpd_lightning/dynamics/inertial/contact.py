@@ -59,7 +59,7 @@ class ContactPoints:
 
 @dataclass(frozen=True)
 class BodyContacts:
-    """For each probe: the nearest probe of another body whose normal is known, and whether that says anything."""
+    """For each probe: the nearest probe of another body whose normal is known, and whether it is valid."""
 
     other: Int[Tensor, "batch probe"]
     known: Bool[Tensor, "batch probe"]
@@ -175,7 +175,7 @@ class ContactSolver:
         num_iterations: int,
         max_depth: float,
     ) -> Resolved:
-        """Return the step without penetration; ``static`` says what stands still near each point."""
+        """Return the step without penetration; ``static`` describes what stands still near each point."""
         known = (static.normals.square().sum(dim=-1) > 0.5) & (static.distances > -max_depth)
         touchable = (self.points.members > 0) & known[:, None]
         motion, touches = free, []

@@ -28,7 +28,7 @@ from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles
 
 _PAIR_REACH = 1.5
-"""Spacings beside the nearest particle of another body within which that still says where its surface is."""
+"""Spacings beside the nearest particle of another body within which that still locates its surface."""
 
 
 _BOUNCE_SHARE = 0.3
@@ -62,7 +62,7 @@ class InertialMemory:
 class InertialDynamics(AbstractDynamics):
     """Newton's first law built in, the second learned.
 
-    What may move is divided into bodies (``graph.bodies``); ``first_velocity`` says how each moved between the two
+    What may move is divided into bodies (``graph.bodies``); ``first_velocity`` estimates how each moved between the two
     frames. Each step goes on with the carried velocity, lets ``BodyForces`` push, lets what is stretched return, keeps
     bodies out of what stands still and of one another (``ContactSolver``), and moves their particles. How a body
     slides, bounces, weighs and deforms is inferred from its features (``MaterialNetwork``). A body that touches

@@ -182,7 +182,7 @@ class FirstVelocity(nn.Module):
         middle = _masked_mean(target.positions, target.mask)
         heights = weights @ ((target.positions - middle) * target.normals).sum(dim=-1, keepdim=True)
         off_plane = heights.squeeze(-1) - ((at - middle) * normals).sum(dim=-1)
-        # A point whose plane is far off has no match there, whatever the soft one says (Geman-McClure weights).
+        # A point whose plane is far off has no match there, whatever the soft match is (Geman-McClure weights).
         trust = 1 / (1 + (off_plane.detach() / smallest.clamp(min=1e-9)).square())
         plane_weights = belief * trust * (normals.square().sum(dim=-1) > 0.5)
 
@@ -196,11 +196,11 @@ class FirstVelocity(nn.Module):
         plane = members * plane_weights[:, None]
         variety = self._variety(some.colors, members)
         pull = self.tangential_weight * (0.1 + 0.9 * variety)
-        loose = members * pull[..., None] * belief[:, None]
+        point_weights = members * pull[..., None] * belief[:, None]
         matrix = torch.einsum("bkp,bkpi,bkpj->bkij", plane, along_normal, along_normal)
-        matrix = matrix + torch.einsum("bkp,bkpai,bkpaj->bkij", loose, along_axes, along_axes)
+        matrix = matrix + torch.einsum("bkp,bkpai,bkpaj->bkij", point_weights, along_axes, along_axes)
         right = torch.einsum("bkp,bkpi,bp->bki", plane, along_normal, off_plane)
-        right = right + torch.einsum("bkp,bkpai,bpa->bki", loose, along_axes, matched - at)
+        right = right + torch.einsum("bkp,bkpai,bpa->bki", point_weights, along_axes, matched - at)
         count = members.sum(dim=2)[..., None]
         ridge = torch.eye(6, dtype=at.dtype, device=at.device) * (1e-6 * count[..., None] + 1e-9)
         rest = self.rest_weight * (1.02 - variety)[..., None] * count

@@ -11,11 +11,11 @@ class ResNetTrunk(nn.Module):
     """Images to feature maps of 1/32 of their size (rounded up).
 
     A 7x7 convolution of stride 2, a 3x3 max-pool of stride 2, then one stage per entry of ``widths`` with as many basic
-    blocks as ``blocks`` says; the first block of each stage but the first has stride 2. ResNet-18 has widths 64, 128,
+    blocks as ``blocks`` gives; the first block of each stage but the first has stride 2. ResNet-18 has widths 64, 128,
     256, 512 and two blocks each: 11,176,512 parameters.
 
     ``num_groups`` is that of group normalisation (Wu and He 2018); ``None`` takes batch normalisation, which needs
-    large batches on each device and tells training from evaluation.
+    large batches on each device and differs between training and evaluation.
     """
 
     def __init__(self, *, in_channels: int, widths: Sequence[int], blocks: Sequence[int], num_groups: int | None):

@@ -21,13 +21,13 @@ class UnprojectingEncoder(AbstractEncoder):
 
     ``num_particles`` are chosen uniformly at random among the pixels inside the workspace. With ``moving_fraction``
     (and a ``background`` model) up to that share of them is chosen among pixels that may be moving. With
-    ``color_features`` the first three features are the colours of the pixels, whatever the network says.
+    ``color_features`` the first three features are the colours of the pixels, whatever the network predicts.
     """
 
     # Paper: moving_fraction, background, use_normals and color_features are ours; None, None, False, False is the
     # paper.
 
-    # What a person is told to look at where no pixel lies in the workspace.
+    # What the error message names where no pixel lies in the workspace.
     _empty_advice = "Check depth (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."
 
     def __init__(
@@ -98,8 +98,8 @@ class UnprojectingEncoder(AbstractEncoder):
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
         moving = None
         if self.background is not None:
-            loose = self.background(_cropped(frames, candidates))
-            moving, border = (pixels.flatten(1) for pixels in _with_border(loose))
+            dynamic_mask = self.background(_cropped(frames, candidates))
+            moving, border = (pixels.flatten(1) for pixels in _with_border(dynamic_mask))
             candidates = candidates & ~border
         index, valid = self._choose(candidates, moving, keys, purpose)
 
@@ -128,11 +128,11 @@ class UnprojectingEncoder(AbstractEncoder):
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
         measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
-        loose = candidates & self.background(_cropped(frames, candidates)).flatten(1)
+        dynamic_mask = candidates & self.background(_cropped(frames, candidates)).flatten(1)
         count = max(1, self.num_particles // 4)
         drawn = [
             choose(allowed, count, generator)
-            for allowed, generator in zip(loose, keys.generators(f"observed/{purpose}"), strict=True)
+            for allowed, generator in zip(dynamic_mask, keys.generators(f"observed/{purpose}"), strict=True)
         ]
         index, mask = (torch.stack(parts) for parts in zip(*drawn, strict=True))
         rgb = self._colors(frames).flatten(1, 3)

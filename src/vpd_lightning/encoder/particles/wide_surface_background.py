@@ -1,4 +1,4 @@
-"""What stands still, told from one frame: wide smooth surfaces. No fixed cameras, no training."""
+"""What stands still, found from one frame: wide smooth surfaces. No fixed cameras, no training."""
 
 import hashlib
 from collections import OrderedDict
@@ -18,7 +18,7 @@ from vpd_lightning.types import RGBDFrames
 class WideSurfaceBackground(AbstractBackground):
     """Marks pixels that belong to no wide smooth surface as what may move; see ``geometry.wide_surfaces``.
 
-    A body is smaller than what it lies on. So a body at rest, which may be struck later, is told from the floor as well
+    A body is smaller than what it lies on. So a body at rest, which may be struck later, is found as well
     as one in flight, and its shadow is not taken for a body. ``max_slope`` and ``max_turn_degrees`` say how smooth,
     ``min_width`` (a share of all that is seen) how wide, ``tolerance`` (in pixels) how close to a surface is on it.
 
@@ -82,7 +82,7 @@ class WideSurfaceBackground(AbstractBackground):
             min_width=self.min_width,
             tolerance=self.tolerance,
         )
-        # Without a normal (image borders, single pixels) nothing can be said; what cannot be told stands still.
+        # Without a normal (image borders, single pixels) nothing is known; such pixels count as static.
         return valid.numpy() & ~wide & ((normals**2).sum(axis=-1) > 0.5)
 
 

@@ -1,4 +1,4 @@
-"""A network like PointNeRF's that says how a particle's feature looks from a location near it."""
+"""A network like PointNeRF's that maps a particle's feature and relative location to the feature of a sample."""
 
 import torch
 from jaxtyping import Float
@@ -16,7 +16,7 @@ class FeatureNetwork(nn.Module):
     behind it. At 16 features, width 64, two hidden layers and degree 5: (16 + 33) * 64 + 64, 64 * 64 + 64 and
     64 * 16 + 16, 8,400 parameters in all.
 
-    ``is_inverse_distance`` asks whoever sums over neighbours to weigh them by the share of their inverse distance, as
+    With ``is_inverse_distance`` the sum over neighbours weighs them by the share of their inverse distance, as
     PointNeRF does, on top of the kernels.
     """
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from vpd_lightning.graph.neighbors import Neighbors
 from vpd_lightning.renderer.features.neighbor_features import NeighborFeatures, gathered_neighbors
 from vpd_lightning.renderer.kernels.fused_features import fused_annular_features
-from vpd_lightning.renderer.rays.chunked_rays import recomputed
+from vpd_lightning.renderer.rays.chunked_rays import checkpointed
 from vpd_lightning.renderer.rays.particle_search import ParticleSearch, morton_sorted
 from vpd_lightning.types import Particles
 
@@ -18,7 +18,7 @@ class SampleFeatures:
     """The particles of a batch, made ready once and then asked for the features of many locations.
 
     ``max_radius`` (metres, ``None``: no limit) leaves out what is farther, see ``bounds.feature_error_bound``.
-    ``is_recomputed`` keeps, of all that lies between particles and features, only the neighbours' indices for the
+    ``is_checkpointed`` keeps, of all that lies between particles and features, only the neighbours' indices for the
     backward pass. A fused backend does that by itself; to sum once more costs it next to nothing, and ``auto`` may have
     to fall back to one that keeps everything. ``variant`` may make the features others than the paper's, which no fused
     backend computes; ``None`` is the paper's.
@@ -35,7 +35,7 @@ class SampleFeatures:
         neighbors_backend: str,
         features_backend: str,
         is_sorted: bool,
-        is_recomputed: bool,
+        is_checkpointed: bool,
         variant: NeighborFeatures | None,
     ) -> None:
         # Padding may hold anything, and index 0 stands for "no neighbour" too: what it holds must at least be finite.
@@ -52,7 +52,7 @@ class SampleFeatures:
         self._num_neighbors, self._max_radius = num_neighbors, max_radius
         self._kernels = (kernel_radii, kernel_bandwidths)
         self._features_backend = features_backend
-        self._is_recomputed = is_recomputed
+        self._is_checkpointed = is_checkpointed
         self._variant = variant
 
     def __call__(self, points: Float[Tensor, "batch ray sample 3"]) -> Float[Tensor, "batch ray sample feature"]:
@@ -64,7 +64,7 @@ class SampleFeatures:
     def of_rows(self, points: Float[Tensor, "row 3"], counts: Sequence[int]) -> Float[Tensor, "row feature"]:
         """Return the features of locations: the first ``counts[0]`` lie in the first member's scene, and so on."""
         found = self._search.knn(points, counts, self._num_neighbors, self._max_radius)
-        if not (self._is_recomputed and torch.is_grad_enabled()):
+        if not (self._is_checkpointed and torch.is_grad_enabled()):
             return self._summed(points, self._particles, found)
         # Half of the bytes, and nothing else of the neighbours lives until the backward pass; -1 for none.
         packed = found.index.masked_fill(~found.mask, -1).int()
@@ -73,7 +73,7 @@ class SampleFeatures:
             particles = Particles(positions, latents, self._particles.mask)
             return self._summed(points, particles, _unpacked(packed))
 
-        return recomputed(again, self._particles.positions, self._particles.features, is_enabled=True)
+        return checkpointed(again, self._particles.positions, self._particles.features, is_enabled=True)
 
     def _summed(
         self, points: Float[Tensor, "row 3"], particles: Particles, neighbors: Neighbors

@@ -121,7 +121,7 @@ def _padded(rows: Tensor, missing_kernels: int = 0) -> Tensor:
 def _padded_kernels(
     kernel_radii: Sequence[float], kernel_bandwidths: Sequence[float], dtype: torch.dtype
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return radii and inverse bandwidths, filled up with kernels whose sums nobody reads."""
+    """Return radii and inverse bandwidths, zero-padded to a multiple of ``KERNELS``."""
     missing = -len(kernel_radii) % KERNELS
     real = np.float64 if dtype == torch.float64 else np.float32
     radii = np.array([*kernel_radii, *[0.0] * missing], real)

@@ -27,7 +27,7 @@ def ray_slices(num_rays: int, batch_size: int, ray_chunk_size: int) -> Iterator[
         yield slice(start, min(start + step, num_rays))
 
 
-def recomputed(function: Callable[..., Any], *inputs: Tensor | None, is_enabled: bool) -> Any:
+def checkpointed(function: Callable[..., Any], *inputs: Tensor | None, is_enabled: bool) -> Any:
     """Call ``function``; when enabled, keep only its inputs and compute it again in the backward pass.
 
     The gradients are exact. Nothing in ``function`` may be random: random numbers are drawn before.

@@ -17,7 +17,7 @@ class BesideAndBehind:
 
     ``beside^2 + 0.04 max(0, along - first - depth)^2``, where ``first`` is the smallest ``along`` of all particles
     within ``width`` of the ray (of those farther away, ``500 / width max(0, beside^2 - width^2)`` is added). What is
-    closer than ``near``, or behind the camera, is left out. Nothing in it knows how long a metre is.
+    closer than ``near``, or behind the camera, is left out. Nothing in it depends on the unit of length.
     """
 
     near: float

@@ -1,4 +1,4 @@
-"""Keeps a running average of the weights beside those that are trained; validations and checkpoints speak of it."""
+"""Keeps a running average of the weights beside those that are trained; validations and checkpoints use it."""
 
 from typing import Any
 

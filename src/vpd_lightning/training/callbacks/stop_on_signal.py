@@ -73,7 +73,7 @@ class StopOnSignal(Checkpoint):
     def _save_and_stop(self, trainer: pl.Trainer) -> None:
         save_checkpoint(trainer, LAST)
         received = torch.tensor(self._received, device=trainer.strategy.root_device)
-        number = int(trainer.strategy.reduce(received, reduce_op="max"))  # not every rank was told
+        number = int(trainer.strategy.reduce(received, reduce_op="max"))  # not every rank received it
         if trainer.is_global_zero:
             name = signal.Signals(number).name
             is_queued = number == signal.SIGUSR1 and _requeue()

@@ -20,7 +20,7 @@ class TimeBudget(pl.Callback):
     """Stops after ``minutes`` of training steps; null trains for ``trainer.max_steps`` and only measures the time.
 
     ``clock`` is ``wall``, or ``cpu``: the processor time of this process, which other work on the same machine hardly
-    changes; it knows nothing of loader workers and accelerators. With several devices, the first one's time counts.
+    changes; it does not depend on loader workers or accelerators. With several devices, the first one's time counts.
     Reading data counts; validations, pictures and
     checkpoints do not. The learning rate's schedule follows the time: the updates that the budget will allow are
     estimated from the pace so far. Such a training does not repeat bit for bit. The time used is written to
