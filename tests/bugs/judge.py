@@ -11,6 +11,9 @@ How to judge a changed suite (``tests/bugs/before.json`` is what the suite found
    ``python -m tests.bugs.judge --bugs 3,17 --hits hits.jsonl slow.jsonl --out tests/bugs/after.json``: slow tests are
    part of the suite as well. Results of other faults stay in the file.
 
+``tests/bugs/after.json`` was made in the short way: each fault that was found before was given to the test that found
+it then, in the reworked suite; null stands for the six that were not found before and were not tried again.
+
 Each fault is put into a copy of the repository, never into the repository itself. The tests that execute its line
 (those that passed when they were recorded) run until one fails, the cheapest files first; then the other tests of the
 same files, which may see the line's work through something that an earlier test left behind (``executes`` is false

@@ -11,6 +11,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from vpd_lightning.moved import current_name
+
 _ABSENT = "(absent)"
 
 
@@ -42,8 +44,8 @@ def different(
     words: str, old: dict[str, Any], new: dict[str, Any] | None, allowed: Mapping[str, Any]
 ) -> dict[str, list[Any]]:
     """Return the keys with another value, and both values; empty where the list of changes accounts for all."""
-    if new is None:
-        return {"": ["composed", "not tried"]}
+    if new is None:  # its option is gone
+        return {} if is_gone(words, allowed) else {"": ["composed", "not tried"]}
     if "error" in old or "error" in new:
         is_same = ("error" in old) == ("error" in new) or ("error" in new and is_gone(words, allowed))
         return {} if is_same else {"error": [old.get("error"), new.get("error")]}
@@ -63,12 +65,12 @@ def is_below(key: str, parents: Mapping[str, str]) -> bool:
 
 
 def flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted keys of a configuration; lists and empty sections count as values."""
+    """Yield the dotted keys of a configuration, classes by today's names; lists and empty sections count as values."""
     if isinstance(config, dict) and config:
         for key, value in config.items():
             yield from flat(value, f"{prefix}.{key}" if prefix else key)
     else:
-        yield prefix, config
+        yield prefix, current_name(config) if isinstance(config, str) else config
 
 
 if __name__ == "__main__":
