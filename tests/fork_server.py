@@ -122,6 +122,7 @@ def popen(
         "cwd": str(Path(cwd or ".").absolute()),
         "env": dict(os.environ if env is None else env),
         "new_session": start_new_session,
+        "ignores_interrupts": signal.getsignal(signal.SIGINT) == signal.SIG_IGN,
     }
     message = json.dumps(request).encode()
     assert len(message) < _LARGEST
@@ -222,6 +223,8 @@ def _tell_end(descriptor: int, pid: int, status: int) -> None:
 
 def become(request: dict[str, Any]) -> None:
     """Be the process that was asked for."""
+    # A start has what its parent has at that time; the server has what its own parent had when it was started.
+    signal.signal(signal.SIGINT, signal.SIG_IGN if request["ignores_interrupts"] else signal.default_int_handler)
     os.environ.clear()
     os.environ.update(request["env"])
     os.chdir(request["cwd"])
