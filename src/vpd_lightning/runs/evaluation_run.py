@@ -44,11 +44,11 @@ def run_evaluation(config: Mapping[str, Any]) -> Path:
     folder = choose_folder(config["out"], beside_checkpoint(model.path, name))
     print(f"{model.name}, step {model.step}: {model.path}", flush=True)
     _require_predictions(model)
+    from vpd_lightning.evaluation.summary import summary_lines  # behind the first line: it imports what measures
+
     with OutputFolder(folder) as partial:
         metrics = _write_evaluation(partial, model, manifest, protocol, config, seen)
     path = folder / "metrics.json"
-    from vpd_lightning.evaluation.summary import summary_lines
-
     print("\n".join(summary_lines(metrics)))
     print()
     print(path)
