@@ -22,7 +22,7 @@ STAMP := $(VENV)/.installed
 
 export MPLBACKEND = Agg
 
-.PHONY: view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-parts test-data test-site test-package test-launchers test-browser test-fast check format format-check lint \
+.PHONY: test-kernels test-benchmarks test-reliability test-documents pages view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-parts test-data test-site test-package test-launchers test-browser test-fast check format format-check lint \
 	types imports docs cluster bench stability paper-step wheel clean
 
 help: ## List the targets
@@ -80,13 +80,14 @@ novel-view-figure: $(STAMP) ## Draw the paper's novel-view figure: a ring of cam
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL = -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 # What has a target of its own: markers, and where the tests that have them lie.
-PARTS = data or site or package or launcher or browser or documents
-PARTS_IN = tests/data_gen tests/integration tests/commands/test_launchers.py tests/viewer tests/test_site.py tests/test_packaging.py tests/documents
+PARTS = data or site or package or launcher or browser or documents or kernels or benchmarks or reliability
+PARTS_IN = tests/data_gen tests/integration tests/commands/test_launchers.py tests/viewer tests/test_site.py tests/test_packaging.py \
+	tests/documents tests/examples tests/stability/test_interpreter_stability.py tests/renderer tests/graph tests/benchmarks tests/reliability
 
 test: $(STAMP) ## Run the tests, but for the parts below; of the stability matrix a part that covers it (no GPU, no torch-cluster)
 	$(PYTEST) $(PARALLEL) -m "not exhaustive and not ($(PARTS))" --durations=15 --durations-min=5 $(PYTEST_ARGS)
 
-test-parts: $(STAMP) ## Run the six parts below in one go
+test-parts: $(STAMP) ## Run the nine parts below in one go
 	$(PYTEST) $(PARALLEL) $(PARTS_IN) -m "$(PARTS)" --durations=15 --durations-min=5 $(PYTEST_ARGS)
 
 test-data: $(STAMP) ## Test that data sets are generated and imported, and that each can be trained on (some need GL)
@@ -104,8 +105,17 @@ test-launchers: $(STAMP) ## Test Hydra's launchers, which start a process for ea
 test-browser: $(STAMP) ## Test the viewer in Chromium
 	$(PYTEST) tests/viewer -m browser
 
-test-documents: $(STAMP) ## Test the commands and the Python that README and docs print, shrunk
-	$(PYTEST) $(PARALLEL) tests/documents -m documents
+test-documents: $(STAMP) ## Test the commands and the Python that README, docs and notebook hold, shrunk
+	$(PYTEST) $(PARALLEL) tests/documents tests/examples -m documents
+
+test-kernels: $(STAMP) ## Test the Triton kernels in Triton's interpreter, stability matrix included
+	$(PYTEST) $(PARALLEL) tests/stability/test_interpreter_stability.py tests/renderer tests/graph -m kernels
+
+test-benchmarks: $(STAMP) ## Test that every benchmark suite runs and writes its files
+	$(PYTEST) $(PARALLEL) tests/benchmarks -m benchmarks
+
+test-reliability: $(STAMP) ## Test what make reliability tests, in small
+	$(PYTEST) tests/reliability -m reliability
 
 test-fast: $(STAMP) ## Run the tests that are not marked slow, without parts and stability matrix (under 2 minutes)
 	$(PYTEST) -n $(WORKERS) --dist loadfile -m "not slow and not ($(PARTS))" --ignore=tests/stability

@@ -14,6 +14,7 @@ REHEARSE = ["--device", "cpu", "--rehearse"]
 
 
 @pytest.mark.slow
+@pytest.mark.benchmarks
 def test_rehearsed_part_is_measured_once(tmp_path: Path, capsys: pytest.CaptureFixture):
     arguments = [*REHEARSE, "--only", "frames", "--out", str(tmp_path)]
 
@@ -29,6 +30,7 @@ def test_rehearsed_part_is_measured_once(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.slow
+@pytest.mark.benchmarks
 @pytest.mark.parametrize("part", ["dynamics", "train_step"])
 def test_every_variant_of_a_part_can_be_rehearsed(part: str, tmp_path: Path):
     assert gpu.main([*REHEARSE, "--only", part, "--out", str(tmp_path)]) == 0
@@ -39,6 +41,7 @@ def test_every_variant_of_a_part_can_be_rehearsed(part: str, tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.benchmarks
 def test_rehearsed_feature_kernel_agrees_with_float64(tmp_path: Path):
     pytest.importorskip("triton")
 
@@ -50,6 +53,7 @@ def test_rehearsed_feature_kernel_agrees_with_float64(tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.benchmarks
 def test_part_that_fails_leaves_its_traceback_and_fails_the_run(tmp_path: Path):
     missing = tmp_path / "no_such_file.json"
 

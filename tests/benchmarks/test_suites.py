@@ -46,6 +46,7 @@ def check(suite: str, result: Result, folder: Path) -> dict:
 
 
 @pytest.mark.slow
+@pytest.mark.benchmarks
 @pytest.mark.parametrize("suite", WITHOUT_CHECKPOINT)
 def test_suite_measures_draws_and_writes(suite: str, tmp_path: Path):
     result = load(suite).run(Options(CPU, "tiny", 1))
@@ -66,6 +67,7 @@ def test_suite_measures_draws_and_writes(suite: str, tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.benchmarks
 @pytest.mark.parametrize("suite", ["accuracy", "rollout"])
 def test_suite_measures_a_checkpoint(suite: str, trained: Path, tmp_path: Path):
     result = load(suite).run(Options(CPU, "tiny", 1, [trained / "checkpoints" / "last.ckpt"]))

@@ -21,6 +21,7 @@ BAD_CONFIGURATIONS = {
     "word for a number": (["seed=abc"], "seed has the wrong type"),
     "word for a stage's number": (["encoder.num_particles=many"], "encoder.num_particles has the wrong type"),
     "fraction for a count": (["data.batch_size=1.5"], "data.batch_size has the wrong type"),
+    "no such precision": (["trainer.precision=half"], "64-true or 64, 32, 16, bf16 or null or auto"),
     "number for a list": (["scene.kernel_radii=3"], "scene.kernel_radii has the wrong type"),
     "unknown experiment": (["experiment=tinny"], "Did you mean tiny?"),
     "unknown option": (["renderer=nerf"], "there is no option of renderer called nerf"),

@@ -50,6 +50,23 @@ def test_run_folder_holds_what_is_needed_to_repeat_the_run(trained: Path, quick:
     assert not list(trained.glob(".claimed"))
 
 
+def test_an_automatic_precision_is_printed_recorded_and_kept(
+    quick: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("vpd_lightning.runs.precision.bfloat16_instructions", lambda: "avx512_bf16")
+    run = tmp_path / "run"
+    words = [*(word for word in quick if not word.startswith("run.")), f"run.folder={run}", "trainer.precision=auto"]
+
+    assert train.main(words) == 0
+
+    assert "precision: bf16-mixed (this processor multiplies bfloat16: avx512_bf16)" in capsys.readouterr().out
+    assert yaml.safe_load((run / "config.yaml").read_text())["trainer"]["precision"] == "bf16-mixed"
+    monkeypatch.setattr("vpd_lightning.runs.precision.bfloat16_instructions", lambda: "")  # another machine
+    assert train.main([f"resume={run}", "trainer.max_steps=3"]) == 0
+    assert "precision: bf16-mixed (as the run began)" in capsys.readouterr().out
+    assert load_checkpoint(run / "checkpoints" / "last.ckpt")["hyper_parameters"]["trainer"]["precision"] == "bf16-mixed"
+
+
 def test_trained_model_loads_and_predicts(trained: Path):
     import vpd_lightning as vpd
 

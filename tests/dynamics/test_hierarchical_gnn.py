@@ -19,6 +19,9 @@ SMALL = {
     "edge_capacity": None,
     "max_abstract_edges_per_node": None,
     "feature_limit": 1e4,
+    "zero_init_decoders": False,
+    "normalized_edges": False,
+    "aggregation": "sum",
     "compile": False,
     "neighbors_backend": "auto",
 }

@@ -31,6 +31,7 @@ def encoder(has_background=True):
         background=background if has_background else None,
         use_normals=True,
         color_features=False,
+        same_pixels=False,
     ).double()
 
 

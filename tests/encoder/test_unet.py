@@ -39,6 +39,7 @@ def encoder(**changes):
         "background": None,
         "use_normals": False,
         "color_features": False,
+        "same_pixels": False,
     }
     return UNetEncoder(**{**arguments, **changes})
 
@@ -210,3 +211,41 @@ def test_background_must_be_fitted_first():
     model = BackgroundModel(num_views=2, height=8, width=8, depth_threshold=0.02)
     with pytest.raises(DataError, match="fitted"):
         model(frames())
+
+
+def test_the_same_pixels_are_chosen_in_both_frames_wherever_they_are_candidates():
+    before = frames(batch=2, num_views=1)
+    after = RGBDFrames(before.rgb, before.depth.clone(), before.cameras)
+    after.depth[:, :, 2] = 0.0  # a row of eight pixels is not measured in the second frame
+
+    def places(same_pixels, seen, purpose):
+        model = encoder(same_pixels=same_pixels, num_particles=30)
+        made = model(seen, RandomKeys(0, 0, [0, 1]), purpose).particles
+        return [{tuple(place) for place in p[m].tolist()} for p, m in zip(made.positions, made.mask, strict=True)]
+
+    same = list(zip(places(True, before, "previous"), places(True, after, "current"), strict=True))
+    drawn = list(zip(places(False, before, "previous"), places(False, after, "current"), strict=True))
+
+    for first, second in same:
+        assert len(first) == len(second) == 30
+        assert {place for place in first if place in second} >= {place for place in first if 2 != row_of(place)}
+    assert same[0][0] != same[1][0]  # members draw their own
+    assert all(len(first & second) < 22 for first, second in drawn)
+
+
+def row_of(place):
+    camera = looking_down(1)
+    pixel, _ = project(torch.tensor(place), camera[0])
+    return int(pixel[1])
+
+
+def test_same_pixels_pad_where_there_are_fewer_candidates_than_particles():
+    data = frames(batch=2, num_views=1)
+    data.depth[:, :, 1:] = 0.0
+
+    made = encoder(same_pixels=True)(data, RandomKeys(0, 0, [0, 1]), "current").particles
+
+    assert made.mask.sum(dim=1).tolist() == [8, 8] and made.mask[:, :8].all()
+    assert not made.positions[:, 8:].any() and not made.features[:, 8:].any()
+    more = encoder(same_pixels=True, num_particles=100)(data, RandomKeys(0, 0, [0, 1]), "current").particles
+    assert more.mask.shape == (2, 100) and more.mask.sum(dim=1).tolist() == [8, 8]

@@ -24,6 +24,7 @@ def test_the_notebook_is_committed_without_outputs(notebook: Any) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.documents
 def test_the_notebook_runs(notebook: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     monkeypatch.setenv("JUPYTER_RUNTIME_DIR", str(tmp_path / "runtime"))

@@ -152,6 +152,7 @@ def test_a_cuda_graph_can_hold_the_search() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.kernels
 @pytest.mark.skipif(IS_INTERPRETED, reason="compiles")
 @pytest.mark.parametrize("capability", [80, 90])
 def test_the_kernel_compiles_for_gpus_without_fused_multiply_adds(capability: int) -> None:
@@ -184,6 +185,7 @@ def test_tensors_on_the_cpu_are_refused_by_name() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.kernels
 @pytest.mark.skipif(IS_INTERPRETED, reason="starts the process that this is")
 def test_in_the_interpreter() -> None:
     result = subprocess.run(

@@ -114,17 +114,22 @@ def build_graph(
     )
 
 
-def _sum_messages(edges: list[Edge], messages: list[Array], num_receivers: int, width: int) -> Array:
+def _gather_messages(
+    edges: list[Edge], messages: list[Array], num_receivers: int, width: int, is_mean: bool
+) -> Array:
+    """Sum the messages that arrive at each receiver, or average them (zero where none arrives)."""
     totals = np.zeros((num_receivers, width))
     for (_, receiver), message in zip(edges, messages, strict=True):
         for channel in range(width):
             totals[receiver, channel] += message[channel]
+    for receiver in range(num_receivers if is_mean else 0):
+        totals[receiver] /= max(1, sum(1 for edge in edges if edge[1] == receiver))
     return totals
 
 
-def _encode_edges(encoder: Mlp, edges: list[Edge], senders: Array, receivers: Array) -> list[Array]:
-    """The initial edge feature is the position of the sender relative to the receiver."""
-    return [encoder(senders[sender] - receivers[receiver]) for sender, receiver in edges]
+def _encode_edges(encoder: Mlp, edges: list[Edge], senders: Array, receivers: Array, unit: float) -> list[Array]:
+    """The initial edge feature is the position of the sender relative to the receiver, in a unit of length."""
+    return [encoder((senders[sender] - receivers[receiver]) / unit) for sender, receiver in edges]
 
 
 def apply(
@@ -134,8 +139,13 @@ def apply(
     current: tuple[Array, Array],
     abstract: Array,
     location_scale: float,
+    units: tuple[float, float] = (1.0, 1.0),
+    is_mean: bool = False,
 ) -> tuple[Array, Array]:
     """Run Algorithm 1 once: (positions, features) of two times -> positions and features of the next.
+
+    ``units`` are those of the edges at particles and of those among abstract nodes (metres in the paper). With
+    ``is_mean`` the messages at a node are averaged, each edge set by itself, instead of summed.
 
     A particle that no abstract node covers gets the zero message; padding rows come back like any uncovered particle.
     """
@@ -144,10 +154,10 @@ def apply(
     previous_nodes = [weights.encode_previous(feature) for feature in previous_z]
     current_nodes = [weights.encode_current(feature) for feature in current_z]
     width = len(weights.encode_current.layers[-1][1])
-    from_previous = _encode_edges(weights.encode_previous_to_abstract, graph.previous_to_abstract, previous_x, abstract)
-    from_current = _encode_edges(weights.encode_current_to_abstract, graph.current_to_abstract, current_x, abstract)
-    among = _encode_edges(weights.encode_abstract_to_abstract, graph.abstract_to_abstract, abstract, abstract)
-    back = _encode_edges(weights.encode_abstract_to_current, graph.abstract_to_current, abstract, current_x)
+    from_previous = _encode_edges(weights.encode_previous_to_abstract, graph.previous_to_abstract, previous_x, abstract, units[0])
+    from_current = _encode_edges(weights.encode_current_to_abstract, graph.current_to_abstract, current_x, abstract, units[0])
+    among = _encode_edges(weights.encode_abstract_to_abstract, graph.abstract_to_abstract, abstract, abstract, units[1])
+    back = _encode_edges(weights.encode_abstract_to_current, graph.abstract_to_current, abstract, current_x, units[0])
 
     # Update particle -> abstract edges; the receiving abstract nodes have no features yet.
     from_previous = [
@@ -159,8 +169,8 @@ def apply(
         for edge, (sender, _) in zip(from_current, graph.current_to_abstract, strict=True)
     ]
     # Update abstract nodes: nothing to add the result to.
-    arriving = graph.previous_to_abstract + graph.current_to_abstract
-    sums = _sum_messages(arriving, from_previous + from_current, len(abstract), width)
+    sums = _gather_messages(graph.previous_to_abstract, from_previous, len(abstract), width, is_mean)
+    sums = sums + _gather_messages(graph.current_to_abstract, from_current, len(abstract), width, is_mean)
     nodes = [weights.update_abstract(sums[number]) for number in range(len(abstract))]
 
     # Message passing among abstract nodes.
@@ -169,7 +179,7 @@ def apply(
             edge + update_edge(edge, nodes[sender], nodes[receiver])
             for edge, (sender, receiver) in zip(among, graph.abstract_to_abstract, strict=True)
         ]
-        sums = _sum_messages(graph.abstract_to_abstract, among, len(abstract), width)
+        sums = _gather_messages(graph.abstract_to_abstract, among, len(abstract), width, is_mean)
         nodes = [node + update_node(node, sums[number]) for number, node in enumerate(nodes)]
 
     # Back to the current particles.
@@ -177,7 +187,7 @@ def apply(
         edge + weights.update_abstract_to_current(edge, nodes[sender], current_nodes[receiver])
         for edge, (sender, receiver) in zip(back, graph.abstract_to_current, strict=True)
     ]
-    sums = _sum_messages(graph.abstract_to_current, back, len(current_x), width)
+    sums = _gather_messages(graph.abstract_to_current, back, len(current_x), width, is_mean)
     current_nodes = [node + weights.update_current(node, sums[number]) for number, node in enumerate(current_nodes)]
 
     # Decode and apply.

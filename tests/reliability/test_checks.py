@@ -20,6 +20,7 @@ def assert_kept(outcomes: list[Outcome]) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.reliability
 def test_a_killed_training_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kills, "STEPS", 40)
 
@@ -31,11 +32,13 @@ def test_a_killed_training_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatc
 
 
 @pytest.mark.slow
+@pytest.mark.reliability
 def test_harmed_checkpoints_are_refused(tmp_path: Path) -> None:
     assert_kept(checkpoints.checkpoints(tmp_path, num_flips=20))
 
 
 @pytest.mark.slow
+@pytest.mark.reliability
 def test_mutated_files_are_read_or_refused(tmp_path: Path) -> None:
     pytest.importorskip("rosbags")
     pytest.importorskip("pyarrow")
@@ -45,6 +48,7 @@ def test_mutated_files_are_read_or_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.reliability
 @pytest.mark.skipif(not disks.is_possible(), reason="no mount namespaces here")
 def test_a_disk_that_fails_is_named(tmp_path: Path) -> None:
     assert_kept(disks.disks(tmp_path, harms=["read-only"]))

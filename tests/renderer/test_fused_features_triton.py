@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow
+@pytest.mark.kernels
 def test_the_kernels_pass_the_backends_tests_in_the_interpreter():
     pytest.importorskip("triton")
     # Triton decides when it is imported, so this needs a process of its own.
@@ -22,6 +23,7 @@ def test_the_kernels_pass_the_backends_tests_in_the_interpreter():
 
 
 @pytest.mark.slow
+@pytest.mark.kernels
 @pytest.mark.parametrize(("element", "num_kernels", "width"), [("fp32", 4, 16), ("fp64", 5, 17), ("fp32", 1, 1)])
 def test_the_kernels_compile_for_a_gpu(element: str, num_kernels: int, width: int):
     triton = pytest.importorskip("triton")

@@ -15,6 +15,7 @@ FILES = ("test_neighbors_stability.py", "test_features_stability.py")
 
 
 @pytest.mark.slow
+@pytest.mark.kernels
 def test_triton_kernels_pass_the_matrix_in_the_interpreter(request: pytest.FixtureRequest, record_property):
     pytest.importorskip("triton")
     # Triton decides when it is imported, so this needs a process of its own: one, because starting it takes long, too.

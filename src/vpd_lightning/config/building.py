@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 # Only classes defined below these packages may be built; see also the packages of loaded plug-ins.
 SYSTEM_PACKAGES = ("vpd_lightning",)  # a system and its parts, whose description may come from anywhere
 ALLOWED_PACKAGES = (*SYSTEM_PACKAGES, "torch.optim", "lightning.pytorch")
+WORDS_OF_OUR_OWN = {"trainer.precision": "auto"}
+"""Values that the class does not know: the command puts another in their place before it is built."""
 _REFERENCE = "${"
 STAGES = {
     "encoder": ("vpd_lightning.encoder.base", "AbstractEncoder"),
@@ -245,10 +247,12 @@ def _check_arguments(target: type, section: Mapping[str, Any], name: str, given:
             near = get_close_matches(key, named, n=1)
             hint = f"Did you mean {name}.{near[0]}?" if near else f"It takes: {', '.join(named)}."
             raise ConfigError(f"there is no key {name}.{key}: {target.__name__} takes no such argument.\n{hint}")
+        if WORDS_OF_OUR_OWN.get(f"{name}.{key}") == value and value is not None:
+            continue
         if not isinstance(value, Mapping) and not fits(value, hints.get(key, Any)):
-            raise ConfigError(
-                f"{name}.{key} has the wrong type.\nGiven: {value!r}. {target.__name__} wants {_spell(hints[key])}."
-            )
+            own = WORDS_OF_OUR_OWN.get(f"{name}.{key}")
+            wanted = _spell(hints[key]) + (f" or {own}" if own else "")
+            raise ConfigError(f"{name}.{key} has the wrong type.\nGiven: {value!r}. {target.__name__} wants {wanted}.")
     absent = [key for key, p in named.items() if p.default is p.empty and key not in section and key not in given]
     if absent and not (name == "model" and set(absent) <= set(STAGES)):
         raise ConfigError(f"{name} lacks {', '.join(absent)}.\n{target.__name__} needs a value for each.")
@@ -297,6 +301,8 @@ def _spell(hint: Any) -> str:
     words = {int: "a whole number", float: "a number", str: "a word", bool: "true or false", type(None): "null"}
     if get_origin(hint) in (Union, types.UnionType):
         return " or ".join(_spell(option) for option in get_args(hint))
+    if get_origin(hint) is Literal:
+        return ", ".join(map(str, get_args(hint)))
     if get_origin(hint) is not None and get_args(hint) and issubclass(list, get_origin(hint)):
         return f"a list of ({_spell(get_args(hint)[0])})"
     return words.get(hint) or str(getattr(hint, "__name__", hint))

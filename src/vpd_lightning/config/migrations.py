@@ -27,6 +27,9 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "compile": False,
         "max_abstract_edges_per_node": None,
         "feature_limit": 1e4,
+        "zero_init_decoders": False,
+        "normalized_edges": False,
+        "aggregation": "sum",
     },
     f"{_DYNAMICS}inertial.InertialDynamics": {"keep_shape": True, "carry_memory": True},
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},
@@ -38,7 +41,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "color_features": False,
         "background_frequencies": 0,
     },
-    "vpd_lightning.encoder.unet.UNetEncoder": {"color_features": False},
+    "vpd_lightning.encoder.unet.UNetEncoder": {"color_features": False, "same_pixels": False},
 }
 """By class: arguments added since the first checkpoints, with values that leave those models as they were."""
 

@@ -17,7 +17,7 @@ from vpd_lightning.dynamics.blocks import MLP, EdgeUpdater, NodeUpdater
 from vpd_lightning.dynamics.delayed_faults import DelayedFaults
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.graph.hierarchical import EdgeSet, HierarchicalGraph, build_graph, draw_priorities
-from vpd_lightning.graph.incidence import gather_to_edges
+from vpd_lightning.graph.incidence import Incidence, gather_to_edges
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.graph.static_graph import build_static_graph
 from vpd_lightning.randomness import RandomKeys
@@ -59,6 +59,16 @@ class HierarchicalGNNDynamics(AbstractDynamics):
 
     Checkpoints from before these three arguments load with null, null and false (``config.migrations``): what they did.
 
+    ``zero_init_decoders`` starts the last layers of both decoders at zero, so that before training nothing moves and no
+    feature changes. ``normalized_edges`` divides relative positions by the radius within which edges are drawn (``r_s``
+    or ``r_a_s``): the same functions, from inputs of order one whatever the scene's unit of length.
+
+    ``aggregation`` says how edges are brought together at a node: their ``sum``, or their ``mean``, whose size does not
+    depend on how many particles lie around a node.
+
+    # Paper: neither of the first two; relative positions of a few centimetres are a hundredth of what the layers are
+    # initialised for. Its aggregation is not printed.
+
     ``last_uncovered_share`` is the share of current particles without abstract node in reach in the last call.
     """
 
@@ -81,6 +91,9 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         edge_capacity: int | None,
         max_abstract_edges_per_node: int | None,
         compile: bool,
+        zero_init_decoders: bool,
+        normalized_edges: bool,
+        aggregation: str,
     ) -> None:
         super().__init__()
         counts = {
@@ -102,6 +115,8 @@ class HierarchicalGNNDynamics(AbstractDynamics):
                 raise ValueError(f"{name} must be greater than 0, got {value}.")
         if neighbors_backend not in ("auto", *BACKENDS):
             raise ValueError(f"neighbors_backend must be auto or one of {BACKENDS}, got {neighbors_backend!r}.")
+        if aggregation not in ("sum", "mean"):
+            raise ValueError(f"aggregation must be sum or mean, got {aggregation!r}.")
         if compile and edge_capacity is None:
             raise ValueError("compile=true needs fixed shapes: set edge_capacity, the most edges among abstract nodes.")
         self.num_abstract_nodes = num_abstract_nodes
@@ -111,6 +126,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         self.neighbors_backend = neighbors_backend
         self.edge_capacity, self.max_abstract_edges_per_node = edge_capacity, max_abstract_edges_per_node
         self.is_compiled = compile
+        self.normalized_edges, self.aggregation = normalized_edges, aggregation
         self.last_uncovered_share = self.last_dropped_edges = None
         self._faults = DelayedFaults()
         widths = (hidden_dim, hidden_dim)
@@ -138,6 +154,9 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         )
         self.decode_location = MLP(hidden_dim, (hidden_dim, hidden_dim, hidden_dim, 3))
         self.decode_feature = MLP(hidden_dim, (hidden_dim, hidden_dim, hidden_dim, feature_dim))
+        if zero_init_decoders:
+            for decoder in (self.decode_location, self.decode_feature):
+                nn.init.zeros_(decoder.layers[-1].weight)
 
     def forward(
         self, previous: Particles, current: Particles, memory: Any, keys: RandomKeys, rollout_step: int
@@ -252,14 +271,17 @@ class HierarchicalGNNDynamics(AbstractDynamics):
             relative = gather_to_edges(
                 positions[sender_type], edge_set.senders, -positions[receiver_type], edge_set.receivers
             )
+            if self.normalized_edges:
+                relative = relative / (self.r_a_s if sender_type == receiver_type else self.r_s)
             edges[name] = self.encode_edge[name](relative)
 
         # Update particle -> abstract edges, then abstract nodes.
         messages = []
+        gathered = Incidence.mean if self.aggregation == "mean" else Incidence.summed
         for sender_type in ("previous", "current"):
             name = f"{sender_type}_to_abstract"
             updated = self.update_edge[name](edges.pop(name), nodes[sender_type], None, edge_sets[name])
-            messages.append(edge_sets[name].receivers.summed(updated))
+            messages.append(gathered(edge_sets[name].receivers, updated))
         abstract = self.update_node["abstract_first"](None, messages[0] + messages[1])
 
         # Perform message passing among abstract nodes.
@@ -268,14 +290,14 @@ class HierarchicalGNNDynamics(AbstractDynamics):
             self.update_edge["abstract_to_abstract"], self.update_node["abstract"], strict=True
         ):
             among = update_edge(among, abstract, abstract, edge_set)
-            abstract = update_node(abstract, edge_set.receivers.summed(among))
+            abstract = update_node(abstract, gathered(edge_set.receivers, among))
 
         # Update abstract -> current edges, then current particles.
         edge_set = edge_sets["abstract_to_current"]
         updated = self.update_edge["abstract_to_current"](
             edges.pop("abstract_to_current"), abstract, nodes["current"], edge_set
         )
-        return self.update_node["current"](nodes["current"], edge_set.receivers.summed(updated))
+        return self.update_node["current"](nodes["current"], gathered(edge_set.receivers, updated))
 
 
 def _usable(particles: Particles, name: str) -> Float[Tensor, "node any"]:

@@ -35,6 +35,7 @@ class UNetEncoder(UnprojectingEncoder):
         background: AbstractBackground | None,
         use_normals: bool,
         color_features: bool,
+        same_pixels: bool,
     ):
         super().__init__(
             network=UNetNetwork(channels=channels, in_channels=3),
@@ -46,6 +47,7 @@ class UNetEncoder(UnprojectingEncoder):
             background=background,
             use_normals=use_normals,
             color_features=color_features,
+            same_pixels=same_pixels,
         )
 
     def pixel_features(self, rgb: Float[Tensor, "*shape height width 3"]) -> Tensor:

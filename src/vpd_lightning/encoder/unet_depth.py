@@ -51,6 +51,7 @@ class DepthPredictingEncoder(UnprojectingEncoder):
             background=None,
             use_normals=False,
             color_features=False,
+            same_pixels=False,
         )
         last = network.up[-1]
         assert isinstance(last, nn.Conv2d) and last.bias is not None

@@ -30,3 +30,17 @@ def choose(
     chosen[: len(order)] = index[order]
     valid[: len(order)] = True
     return chosen, valid
+
+
+def choose_same(
+    candidates: Bool[Tensor, " point"], count: int, generator: torch.Generator
+) -> tuple[Int[Tensor, " particle"], Bool[Tensor, " particle"]]:
+    """As ``choose``, but equal generators choose the same points wherever these are candidates.
+
+    Every point gets a random rank, candidate or not, and the candidates of the lowest ranks are chosen.
+    """
+    ranks = torch.randperm(len(candidates), generator=generator)
+    order = ranks.to(candidates.device).masked_fill(~candidates, len(candidates)).argsort()[:count]
+    index = torch.nn.functional.pad(order, (0, count - len(order)))
+    valid = torch.arange(count, device=index.device) < candidates.sum()
+    return torch.where(valid, index, 0), valid

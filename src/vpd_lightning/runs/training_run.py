@@ -20,6 +20,7 @@ from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.randomness import derive_seed
 from vpd_lightning.runs.environment import environment
 from vpd_lightning.runs.first_training import FirstTraining, hand_over, train_first
+from vpd_lightning.runs.precision import AUTO, chosen_precision
 from vpd_lightning.runs.provide_data import provide_data, require_trusted_data
 from vpd_lightning.runs.resume import OVERRIDES_FILE, has_own_checkpoint, quote
 from vpd_lightning.runs.run_claim import claimed
@@ -54,7 +55,7 @@ def train_in(folder: Path, config: dict[str, Any], overrides: Sequence[str], *, 
     with claimed(folder, is_new=is_new) if is_rank_zero else nullcontext():
         try:
             with named_memory_errors(), named_disk_errors(folder), _libraries_in_log():
-                _set_numerics(config)
+                _set_numerics(config, folder, is_rank_zero)
                 if is_new and config["pretraining"]:  # the first training may end before fit() describes the second
                     _describe(folder, config, overrides, is_resumed=False)
                 first = train_first(folder, config, overrides, is_rank_zero, fit)
@@ -140,8 +141,13 @@ def _fit_background(system: AbstractSystem, datamodule: Any) -> None:
         background.fit(*datamodule.median_background())
 
 
-def _set_numerics(config: dict[str, Any]) -> None:
-    """Set threads and the precision of float32 products explicitly, and write down what was set."""
+def _set_numerics(config: dict[str, Any], folder: Path, is_rank_zero: bool) -> None:
+    """Set threads and precisions explicitly, and write down what was set."""
+    if config["trainer"].get("precision") == AUTO:
+        chosen, reason = chosen_precision(config["trainer"], folder / CONFIG_FILE if config["resume"] else None)
+        config["trainer"]["precision"] = chosen  # from here on it is what was asked for, in the run's own files, too
+        if is_rank_zero:
+            print(f"precision: {chosen} ({reason})", flush=True)
     if config["num_threads"] is not None:
         torch.set_num_threads(config["num_threads"])
     precision = config["float32_matmul_precision"]

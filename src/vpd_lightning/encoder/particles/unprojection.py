@@ -11,7 +11,8 @@ from vpd_lightning.encoder.base import AbstractBackground, AbstractEncoder
 from vpd_lightning.errors import EmptyWorkspaceError
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.geometry.normals import depth_normals
-from vpd_lightning.geometry.workspace import choose, inside_workspace
+from vpd_lightning.geometry import workspace
+from vpd_lightning.geometry.workspace import inside_workspace
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles, RGBDFrames, require_finite
 
@@ -21,11 +22,13 @@ class UnprojectingEncoder(AbstractEncoder):
 
     ``num_particles`` are chosen uniformly at random among the pixels inside the workspace. With ``moving_fraction``
     (and a ``background`` model) up to that share of them is chosen among pixels that may be moving. With
-    ``color_features`` the first three features are the colours of the pixels, whatever the network predicts.
+    ``color_features`` the first three features are the colours of the pixels, whatever the network predicts. With
+    ``same_pixels`` the particles of both context frames are the same pixels, wherever these lie in the workspace.
     """
 
-    # Paper: moving_fraction, background, use_normals and color_features are ours; None, None, False, False is the
-    # paper.
+    # Paper: moving_fraction, background, use_normals, color_features and same_pixels are ours; None, None, False, False,
+    # False is the paper. Its 2^14 particles are all pixels of a camera, or many of a body's; with a few of them chosen
+    # twice, the centre of what is seen of a body moves by chance about as far as the body does in a step.
 
     # What the error message names where no pixel lies in the workspace.
     _empty_advice = "Check depth (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."
@@ -42,6 +45,7 @@ class UnprojectingEncoder(AbstractEncoder):
         background: AbstractBackground | None,
         use_normals: bool,
         color_features: bool,
+        same_pixels: bool,
     ):
         super().__init__()
         if num_particles < 1:
@@ -62,6 +66,7 @@ class UnprojectingEncoder(AbstractEncoder):
         self.background = background
         self.use_normals = use_normals
         self.color_features = color_features
+        self.same_pixels = same_pixels
 
     @staticmethod
     def _colors(frames: RGBDFrames) -> Float[Tensor, "batch view height width 3"]:
@@ -131,7 +136,7 @@ class UnprojectingEncoder(AbstractEncoder):
         dynamic_mask = candidates & self.background(_cropped(frames, candidates)).flatten(1)
         count = max(1, self.num_particles // 4)
         drawn = [
-            choose(allowed, count, generator)
+            workspace.choose(allowed, count, generator)
             for allowed, generator in zip(dynamic_mask, keys.generators(f"observed/{purpose}"), strict=True)
         ]
         index, mask = (torch.stack(parts) for parts in zip(*drawn, strict=True))
@@ -144,7 +149,8 @@ class UnprojectingEncoder(AbstractEncoder):
         self, candidates: Bool[Tensor, "batch point"], moving: Tensor | None, keys: RandomKeys, purpose: str
     ) -> tuple[Tensor, Tensor]:
         indices, valids = [], []
-        for member, generator in enumerate(keys.generators(f"particles/{purpose}")):
+        choose = workspace.choose_same if self.same_pixels else workspace.choose
+        for member, generator in enumerate(keys.generators(f"particles/{'all' if self.same_pixels else purpose}")):
             allowed = candidates[member]
             if not bool(allowed.any()):
                 low, high = self.workspace_min, self.workspace_max
