@@ -64,7 +64,9 @@ def test_an_automatic_precision_is_printed_recorded_and_kept(
     monkeypatch.setattr("vpd_lightning.runs.precision.bfloat16_instructions", lambda: "")  # another machine
     assert train.main([f"resume={run}", "trainer.max_steps=3"]) == 0
     assert "precision: bf16-mixed (as the run began)" in capsys.readouterr().out
-    assert load_checkpoint(run / "checkpoints" / "last.ckpt")["hyper_parameters"]["trainer"]["precision"] == "bf16-mixed"
+    assert (
+        load_checkpoint(run / "checkpoints" / "last.ckpt")["hyper_parameters"]["trainer"]["precision"] == "bf16-mixed"
+    )
 
 
 def test_trained_model_loads_and_predicts(trained: Path):

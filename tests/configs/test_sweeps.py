@@ -50,7 +50,7 @@ def jobs_that_show_every_word(sweep: str, budget: str) -> list[list[str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("sweep", SWEEPS)
 def test_every_word_of_a_sweep_composes_and_fits_its_classes(sweep: str):
-    # Every model under every budget is composed elsewhere (tests/configs/composed): of the paper's the first job is enough.
+    # Recipes and budgets have tests of their own: under the paper's budget one job of each sweep is enough.
     jobs = [*jobs_that_show_every_word(sweep, "minutes"), jobs_that_show_every_word(sweep, "paper")[0]]
     configs = [compose("train", [*words, "run.folder=chosen"]) for words in jobs]
 

@@ -29,6 +29,7 @@ SMALL = {
     "zero_init_decoders": False,
     "normalized_edges": False,
     "aggregation": "sum",
+    "update_features": True,
     "compile": False,
     "neighbors_backend": "torch",
 }

@@ -22,6 +22,7 @@ SMALL = {
     "zero_init_decoders": False,
     "normalized_edges": False,
     "aggregation": "sum",
+    "update_features": True,
     "compile": False,
     "neighbors_backend": "auto",
 }
@@ -212,3 +213,41 @@ def test_a_particle_that_is_not_a_number_is_refused() -> None:
 def test_values_out_of_range_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         dynamics_of(**{name: value})
+
+
+def test_decoders_that_start_at_zero_leave_everything_as_it_is() -> None:
+    previous, current = particles(1, 40, 0), particles(1, 50, 1)
+    following = step(dynamics_of(zero_init_decoders=True), previous, current, [0])
+    assert torch.equal(following.positions, current.positions) and torch.equal(following.features, current.features)
+    dynamics = dynamics_of(zero_init_decoders=True)
+    step(dynamics, previous, current, [0]).positions.square().sum().backward()
+    assert bool(dynamics.decode_location.layers[-1].weight.grad.any())  # but it learns
+
+
+def test_features_stay_where_they_are_not_updated() -> None:
+    dynamics, previous, current = dynamics_of(update_features=False), particles(1, 40, 0), particles(1, 50, 1)
+    following = step(dynamics, previous, current, [0])
+    assert torch.equal(following.features, current.features)
+    assert not torch.equal(following.positions, current.positions)
+    assert not any(name.startswith("decode_feature") for name, _ in dynamics.named_parameters())
+
+
+def test_normalized_edges_do_not_depend_on_the_unit_of_length() -> None:
+    previous, current = particles(1, 40, 0), particles(1, 50, 1)
+    torch.manual_seed(0)
+    metres = dynamics_of(normalized_edges=True)
+    torch.manual_seed(0)
+    millimetres = dynamics_of(normalized_edges=True, r_s=400.0, r_a_s=900.0, location_scale=100.0)
+    here = step(metres, previous, current, [0])
+    there = step(
+        millimetres,
+        Particles(1000 * previous.positions, previous.features),
+        Particles(1000 * current.positions, current.features),
+        [0],
+    )
+    torch.testing.assert_close(there.positions / 1000, here.positions, rtol=0, atol=1e-10)
+
+
+def test_an_unknown_aggregation_is_refused() -> None:
+    with pytest.raises(ValueError, match="aggregation must be sum or mean, got 'max'"):
+        dynamics_of(aggregation="max")

@@ -114,9 +114,7 @@ def build_graph(
     )
 
 
-def _gather_messages(
-    edges: list[Edge], messages: list[Array], num_receivers: int, width: int, is_mean: bool
-) -> Array:
+def _gather_messages(edges: list[Edge], messages: list[Array], num_receivers: int, width: int, is_mean: bool) -> Array:
     """Sum the messages that arrive at each receiver, or average them (zero where none arrives)."""
     totals = np.zeros((num_receivers, width))
     for (_, receiver), message in zip(edges, messages, strict=True):
@@ -154,8 +152,12 @@ def apply(
     previous_nodes = [weights.encode_previous(feature) for feature in previous_z]
     current_nodes = [weights.encode_current(feature) for feature in current_z]
     width = len(weights.encode_current.layers[-1][1])
-    from_previous = _encode_edges(weights.encode_previous_to_abstract, graph.previous_to_abstract, previous_x, abstract, units[0])
-    from_current = _encode_edges(weights.encode_current_to_abstract, graph.current_to_abstract, current_x, abstract, units[0])
+    from_previous = _encode_edges(
+        weights.encode_previous_to_abstract, graph.previous_to_abstract, previous_x, abstract, units[0]
+    )
+    from_current = _encode_edges(
+        weights.encode_current_to_abstract, graph.current_to_abstract, current_x, abstract, units[0]
+    )
     among = _encode_edges(weights.encode_abstract_to_abstract, graph.abstract_to_abstract, abstract, abstract, units[1])
     back = _encode_edges(weights.encode_abstract_to_current, graph.abstract_to_current, abstract, current_x, units[0])
 

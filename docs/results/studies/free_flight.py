@@ -1,7 +1,8 @@
 """Which link of VPD fails to learn motion: the stages taken apart on two balls in free flight.
 
-``python -m docs.results.studies.free_flight OUT.json [--rows NAME ...] [--updates 600]`` trains the paper's graph network
-on scenes that never repeat, once for each row, and writes how far the centre of each ball is from where it truly is.
+``python -m docs.results.studies.free_flight OUT.json [--rows NAME ...] [--updates 600]`` trains the paper's graph
+network on scenes that never repeat, once for each row, and writes how far the centre of each ball is from where it
+truly is.
 
 - ``targets``: the network alone, from the true displacement of every particle.
 - ``ready``: from pixels, through an encoder and a renderer that have learned to draw from the true motion and stay.
@@ -51,7 +52,7 @@ class Row:
     batch_size: int = 8
     rays_per_step: int = 1024
     message_passing_steps: int = 10
-    fixed_features: bool = False
+    update_features: bool = True
 
 
 ROWS = {
@@ -61,7 +62,7 @@ ROWS = {
     "targets, decoders start at zero": Row("targets", zero_init=True),
     "ready renderer, wide kernels": Row("ready"),
     "ready renderer, narrow kernels": Row("ready", surface_scale=0.1),
-    "ready renderer, wide kernels, features stay": Row("ready", fixed_features=True),
+    "ready renderer, wide kernels, features stay": Row("ready", update_features=False),
     "own renderer, wide kernels": Row("own"),
     "own renderer, narrow kernels": Row("own", surface_scale=0.1),
 }
@@ -84,7 +85,7 @@ class Training:
                 num_abstract_nodes=32, max_abstract_neighbors=2, r_s=0.4, r_a_s=0.8, location_scale=0.1,
                 feature_limit=1e4, neighbors_backend="auto", edge_capacity=None, max_abstract_edges_per_node=None,
                 compile=False, zero_init_decoders=row.zero_init, normalized_edges=row.normalized_edges,
-                aggregation=row.aggregation,
+                aggregation=row.aggregation, update_features=row.update_features,
             ),
             renderer=SplatRenderer(
                 feature_dim=FEATURE_DIM, color_features=True, background_frequencies=4, hidden_dim=96, num_layers=3,
@@ -93,14 +94,11 @@ class Training:
             ),
             location_noise=0.0, checkpoint_dynamics=False, pixel_gradient_to_motion=1.0,
         )  # fmt: skip
-        if row.fixed_features:
-            decoder = self.simulator.dynamics.decode_feature.requires_grad_(False)
-            torch.nn.init.zeros_(decoder.layers[-1].weight)
         pictures = [*self.simulator.encoder.parameters(), *self.simulator.renderer.parameters()]
         self.optimizer = torch.optim.Adam(
             [
                 {"params": pictures, "lr": 2e-3},
-                {"params": [p for p in self.simulator.dynamics.parameters() if p.requires_grad], "lr": 3e-4},
+                {"params": list(self.simulator.dynamics.parameters()), "lr": 3e-4},
             ]
         )
         self.rates = [group["lr"] for group in self.optimizer.param_groups]
@@ -146,9 +144,7 @@ class Training:
         context, keys = flights.batch.context, flights.batch.keys
         made = [self.simulator.encoder(context[:, time], keys, name).particles for time, name in enumerate(("a", "b"))]
         if self.row.link == "targets":
-            made = [
-                replace(one, features=torch.nn.functional.pad(one.colors, (0, FEATURE_DIM - 3))) for one in made
-            ]
+            made = [replace(one, features=torch.nn.functional.pad(one.colors, (0, FEATURE_DIM - 3))) for one in made]
         return made[0], made[1]
 
     def pixel_error(self, states: Sequence[Particles], flights: Flights) -> Tensor:

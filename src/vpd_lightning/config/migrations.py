@@ -30,6 +30,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "zero_init_decoders": False,
         "normalized_edges": False,
         "aggregation": "sum",
+        "update_features": True,
     },
     f"{_DYNAMICS}inertial.InertialDynamics": {"keep_shape": True, "carry_memory": True},
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},

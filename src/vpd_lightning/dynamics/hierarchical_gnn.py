@@ -66,6 +66,11 @@ class HierarchicalGNNDynamics(AbstractDynamics):
     ``aggregation`` says how edges are brought together at a node: their ``sum``, or their ``mean``, whose size does not
     depend on how many particles lie around a node.
 
+    Without ``update_features`` there is no feature decoder, and particles keep the features that they were encoded
+    with: what is seen can only move. With it, a network that does not know the motion yet lowers the error of the
+    pictures by fading bodies, and does not learn how they move.
+
+    # Paper: features are updated.
     # Paper: neither of the first two; relative positions of a few centimetres are a hundredth of what the layers are
     # initialised for. Its aggregation is not printed.
 
@@ -94,6 +99,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         zero_init_decoders: bool,
         normalized_edges: bool,
         aggregation: str,
+        update_features: bool,
     ) -> None:
         super().__init__()
         counts = {
@@ -153,10 +159,13 @@ class HierarchicalGNNDynamics(AbstractDynamics):
             }
         )
         self.decode_location = MLP(hidden_dim, (hidden_dim, hidden_dim, hidden_dim, 3))
-        self.decode_feature = MLP(hidden_dim, (hidden_dim, hidden_dim, hidden_dim, feature_dim))
+        self.decode_feature = (
+            MLP(hidden_dim, (hidden_dim, hidden_dim, hidden_dim, feature_dim)) if update_features else None
+        )
         if zero_init_decoders:
             for decoder in (self.decode_location, self.decode_feature):
-                nn.init.zeros_(decoder.layers[-1].weight)
+                if decoder is not None:
+                    nn.init.zeros_(decoder.layers[-1].weight)
 
     def forward(
         self, previous: Particles, current: Particles, memory: Any, keys: RandomKeys, rollout_step: int
@@ -242,12 +251,14 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         """Return the next positions and features."""
         nodes = self._message_passing(previous, current, graph)
         delta_location = self.decode_location(nodes).view(*current.positions.shape)
-        delta_feature = self.decode_feature(nodes).view(*current.features.shape)
+        delta_feature = None if self.decode_feature is None else self.decode_feature(nodes)
         with torch.autocast(current.positions.device.type, enabled=False):
             delta_location = self.location_scale * torch.tanh(delta_location.to(current.positions.dtype))
             valid = current.mask[..., None]
             positions = torch.where(valid, current.positions + delta_location, current.positions)
-            features = current.features + delta_feature.to(current.features.dtype)
+            if delta_feature is None:
+                return positions, current.features
+            features = current.features + delta_feature.view(*current.features.shape).to(current.features.dtype)
             features = features.clamp(-self.feature_limit, self.feature_limit)
             features = torch.where(valid, features, current.features)
         return positions, features

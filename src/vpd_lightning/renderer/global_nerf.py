@@ -52,7 +52,7 @@ class GlobalNeRFRenderer(AbstractRenderer):
     # renderer, with NeRF's ten octaves of the place, which that one does not need. The root is ours: with entries of
     # 1/16 the scenes' vectors hardly reached the picture, and in training they fell together to a single one.
     # Paper: VPD's coarse tier has the layer of 128 before its colour; this one takes its colour from the trunk, as
-    # NeRF-dy's code base does (33,155 weights fewer). The coarse colour is trained on and never shown.
+    # jaxnerf does without view directions. The coarse colour is trained on and never shown.
 
     def __init__(
         self,

@@ -51,7 +51,8 @@ def bfloat16_instructions() -> str:
     """Return which instructions of this processor multiply bfloat16, nothing where none do."""
     import torch
 
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()
+    read = getattr(torch.cpu, "get_capabilities", None)  # not in every PyTorch
+    capabilities: dict[str, Any] = read() if read else {}
     return next((name for name in _CPU_INSTRUCTIONS if capabilities.get(name)), "")
 
 

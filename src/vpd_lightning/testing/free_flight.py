@@ -89,7 +89,9 @@ class FreeFlight:
         batch = VideoBatch(
             context=RGBDFrames(
                 rgb=torch.stack([(255 * color).round().to(torch.uint8) for color, _ in context], dim=1),
-                depth=torch.stack([distance * (rays.directions * forward).sum(dim=-1) for _, distance in context], dim=1),
+                depth=torch.stack(
+                    [distance * (rays.directions * forward).sum(dim=-1) for _, distance in context], dim=1
+                ),
                 cameras=Cameras(
                     cameras.intrinsics.expand(batch_size, 2, -1, -1, -1),
                     cameras.cam_to_world.expand(batch_size, 2, -1, -1, -1),
@@ -124,7 +126,7 @@ class FreeFlight:
 
 def _seen(
     rays: Rays, centers: Float[Tensor, "batch body 3"]
-) -> tuple[Float[Tensor, "batch *ray 3"], Float[Tensor, "batch *ray"]]:
+) -> tuple[Float[Tensor, "batch *ray 3"], Float[Tensor, " batch *ray"]]:
     """Return colour and distance along the ray of what each ray (``batch *ray``) meets first; 0 where nothing."""
     floor = -rays.origins[..., 2] / rays.directions[..., 2]
     floor = torch.where((floor > 0) & (floor < FAR), floor, FAR)

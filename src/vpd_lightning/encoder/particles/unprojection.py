@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from vpd_lightning.encoder.base import AbstractBackground, AbstractEncoder
 from vpd_lightning.errors import EmptyWorkspaceError
+from vpd_lightning.geometry import workspace
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.geometry.normals import depth_normals
-from vpd_lightning.geometry import workspace
 from vpd_lightning.geometry.workspace import inside_workspace
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles, RGBDFrames, require_finite
@@ -26,9 +26,10 @@ class UnprojectingEncoder(AbstractEncoder):
     ``same_pixels`` the particles of both context frames are the same pixels, wherever these lie in the workspace.
     """
 
-    # Paper: moving_fraction, background, use_normals, color_features and same_pixels are ours; None, None, False, False,
-    # False is the paper. Its 2^14 particles are all pixels of a camera, or many of a body's; with a few of them chosen
-    # twice, the centre of what is seen of a body moves by chance about as far as the body does in a step.
+    # Paper: moving_fraction, background, use_normals, color_features and same_pixels are ours; the paper has none of
+    # them (None, None and three times False). Its 2^14 particles are all pixels of a camera, or many of a body's. Where
+    # a few of them are chosen twice, the centre of what is seen of a body moves by chance about as far as the body does
+    # in a step.
 
     # What the error message names where no pixel lies in the workspace.
     _empty_advice = "Check depth (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."

@@ -1,0 +1,38 @@
+"""The stages of VPD taken apart on balls in free flight, in very small."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from docs.results.studies import free_flight
+from vpd_lightning.testing.free_flight import FreeFlight
+
+
+@pytest.mark.slow
+def test_rows_are_trained_once_and_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(free_flight, "SCENE", FreeFlight(image_size=16, num_cameras=2))
+    monkeypatch.setattr(free_flight, "NUM_TEST", 2)
+    monkeypatch.setattr(
+        free_flight,
+        "ROWS",
+        {
+            name: free_flight.Row(name, batch_size=2, rays_per_step=16, message_passing_steps=1)
+            for name in ("targets", "ready")
+        },
+    )
+    out = tmp_path / "rows.json"
+
+    assert free_flight.main([str(out), "--updates", "3", "--rows", "targets", "ready"]) == 0
+    written = out.read_bytes()
+    assert free_flight.main([str(out), "--updates", "3", "--rows", "targets", "ready"]) == 0
+
+    assert out.read_bytes() == written
+    rows = json.loads(written)
+    assert list(rows) == ["targets", "ready"]
+    for name, row in rows.items():
+        first, last = row["curve"]["0"], row["curve"]["3"]
+        references = first["step_4_cm"]
+        assert references["constant_velocity"] < references["nothing_moves"]
+        assert last["step_1_cm"]["centre"] != first["step_1_cm"]["centre"]
+        assert ("psnr_truly_moved" in last) == (name == "ready")
