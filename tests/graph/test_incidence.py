@@ -107,3 +107,27 @@ def test_sums_on_a_gpu_repeat_bit_for_bit() -> None:
         assert torch.equal(incidence.summed(edges), incidence.summed(edges))
     finally:
         torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.parametrize("width", [1, 2, 3])
+@pytest.mark.parametrize("is_padded", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_sums_and_means_of_a_table_are_those_of_a_loop(width: int, is_padded: bool, dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(width)
+    mask = torch.rand(9, width, generator=generator) < 0.6 if is_padded else torch.ones(9, width, dtype=torch.bool)
+    mask[4] = not is_padded  # with padding, one node has no edge at all
+    edges = torch.randn(9 * width, 5, generator=generator).to(dtype)
+    edges[~mask.flatten()] = torch.nan
+    given = edges.clone()
+    table = Incidence.of_table(mask)
+
+    rows = [[edges[node * width + k].double() for k in range(width) if mask[node, k]] for node in range(9)]
+    sums = torch.stack([sum(row, torch.zeros(5, dtype=torch.float64)) for row in rows])
+    counts = torch.tensor([max(1, len(row)) for row in rows])[:, None]
+
+    # A few sums of numbers of order one: 2^-24 of them in float32, and the result's own 2^-9 in bfloat16.
+    tolerance = 1e-6 if dtype == torch.float32 else 0.02
+    torch.testing.assert_close(table.summed(edges).double(), sums, rtol=0, atol=tolerance)
+    torch.testing.assert_close(table.mean(edges).double(), sums / counts, rtol=0, atol=tolerance)
+    assert table.counts().tolist() == mask.sum(dim=1).tolist()
+    torch.testing.assert_close(edges, given, rtol=0, atol=0, equal_nan=True)  # what was given is not written to
