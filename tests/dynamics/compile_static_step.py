@@ -28,6 +28,7 @@ SMALL = {
     "feature_limit": 1e4,
     "zero_init_decoders": False,
     "normalized_edges": False,
+    "edge_gain": 1.0,
     "aggregation": "sum",
     "update_features": True,
     "compile": False,

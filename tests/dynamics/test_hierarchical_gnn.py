@@ -21,6 +21,7 @@ SMALL = {
     "feature_limit": 1e4,
     "zero_init_decoders": False,
     "normalized_edges": False,
+    "edge_gain": 1.0,
     "aggregation": "sum",
     "update_features": True,
     "compile": False,
@@ -246,6 +247,11 @@ def test_normalized_edges_do_not_depend_on_the_unit_of_length() -> None:
         [0],
     )
     torch.testing.assert_close(there.positions / 1000, here.positions, rtol=0, atol=1e-10)
+
+
+def test_a_gain_without_normalized_edges_is_refused() -> None:
+    with pytest.raises(ValueError, match="edge_gain=3.0 multiplies normalised edges: set normalized_edges=true"):
+        dynamics_of(edge_gain=3.0)
 
 
 def test_an_unknown_aggregation_is_refused() -> None:

@@ -18,13 +18,15 @@ NUM_PREVIOUS, NUM_CURRENT = 22, 25
 VALID = {"previous": [22, 13], "current": [20, 25]}  # per batch member; the rest is padding
 
 
-def _dynamics(normalized_edges: bool = False, aggregation: str = "sum") -> HierarchicalGNNDynamics:
+def _dynamics(
+    normalized_edges: bool = False, aggregation: str = "sum", edge_gain: float = 1.0
+) -> HierarchicalGNNDynamics:
     dynamics = HierarchicalGNNDynamics(
         feature_dim=FEATURE_DIM, hidden_dim=HIDDEN_DIM, message_passing_steps=STEPS, num_abstract_nodes=NUM_ABSTRACT,
         max_abstract_neighbors=MAX_NEIGHBORS, r_s=R_S, r_a_s=R_A_S, location_scale=LOCATION_SCALE,
         neighbors_backend="auto", edge_capacity=None, max_abstract_edges_per_node=None, compile=False,
-        feature_limit=1e4, zero_init_decoders=False, normalized_edges=normalized_edges, aggregation=aggregation,
-        update_features=True,
+        feature_limit=1e4, zero_init_decoders=False, normalized_edges=normalized_edges, edge_gain=edge_gain,
+        aggregation=aggregation, update_features=True,
     )  # fmt: skip
     # No weight stays at a value that would hide it: biases and layer norms are random too.
     generator = torch.Generator().manual_seed(0)
@@ -136,12 +138,13 @@ def _weights(dynamics: HierarchicalGNNDynamics) -> reference.Weights:
 # row varies little; 2e-4 on features of size up to ten.
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-6), (torch.float32, 2e-4)])
 @pytest.mark.parametrize(
-    ("seed", "normalized_edges", "aggregation"), [(0, False, "sum"), (1, False, "sum"), (0, True, "mean")]
+    ("seed", "normalized_edges", "aggregation", "edge_gain"),
+    [(0, False, "sum", 1.0), (1, False, "sum", 1.0), (0, True, "mean", 1.0), (1, True, "mean", 3.0)],
 )
 def test_one_application_matches_the_loops(
-    seed: int, normalized_edges: bool, aggregation: str, dtype: torch.dtype, tolerance: float
+    seed: int, normalized_edges: bool, aggregation: str, edge_gain: float, dtype: torch.dtype, tolerance: float
 ) -> None:
-    dynamics = _dynamics(normalized_edges, aggregation).to(dtype)
+    dynamics = _dynamics(normalized_edges, aggregation, edge_gain).to(dtype)
     previous, current = (particles.to(dtype) for particles in _particles(seed))
     keys = RandomKeys(seed=seed, step=0, sample_index=[0, 1])
     _, abstract, graphs = _graphs(dynamics, previous, current, keys)
@@ -156,7 +159,7 @@ def test_one_application_matches_the_loops(
             (current.positions[member].double().numpy(), current.features[member].double().numpy()),
             abstract[member],
             LOCATION_SCALE,
-            units=(R_S, R_A_S) if normalized_edges else (1.0, 1.0),
+            units=(R_S / edge_gain, R_A_S) if normalized_edges else (1.0, 1.0),
             is_mean=aggregation == "mean",
         )
         valid = current.mask[member].numpy()

@@ -18,21 +18,21 @@ def test_rows_are_trained_once_and_measured(tmp_path: Path, monkeypatch: pytest.
         "ROWS",
         {
             name: free_flight.Row(name, batch_size=2, rays_per_step=16, message_passing_steps=1)
-            for name in ("targets", "ready")
+            for name in ("targets", "ready", "stills")
         },
     )
     out = tmp_path / "rows.json"
 
-    assert free_flight.main([str(out), "--updates", "3", "--rows", "targets", "ready"]) == 0
+    assert free_flight.main([str(out), "--updates", "3", "--rows", "targets", "ready", "stills"]) == 0
     written = out.read_bytes()
-    assert free_flight.main([str(out), "--updates", "3", "--rows", "targets", "ready"]) == 0
+    assert free_flight.main([str(out), "--updates", "3", "--rows", "targets", "ready", "stills"]) == 0
 
     assert out.read_bytes() == written
     rows = json.loads(written)
-    assert list(rows) == ["targets", "ready"]
+    assert list(rows) == ["targets", "ready", "stills"]
     for name, row in rows.items():
         first, last = row["curve"]["0"], row["curve"]["3"]
         references = first["step_4_cm"]
         assert references["constant_velocity"] < references["nothing_moves"]
         assert last["step_1_cm"]["centre"] != first["step_1_cm"]["centre"]
-        assert ("psnr_truly_moved" in last) == (name == "ready")
+        assert ("psnr_truly_moved" in last) == (name != "targets")

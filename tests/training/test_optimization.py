@@ -5,6 +5,7 @@ import torch
 
 from tests.training.tiny_training import tiny_simulator
 from vpd_lightning.config import compose
+from vpd_lightning.errors import ConfigError
 from vpd_lightning.training.optimization import StepDecayAdam, WarmupCosineAdam
 
 ADAM = {"betas": [0.9, 0.999], "eps": 1e-8}
@@ -54,6 +55,23 @@ def test_a_multiplier_of_no_stage_is_refused() -> None:
         settings.build(tiny_simulator(), max_steps=1)
     neutral = WarmupCosineAdam(lr=1.0, stage_multipliers={"decoder": 1.0}, warmup_steps=0, final_share=1.0, **ADAM)
     assert neutral.build(tiny_simulator(), max_steps=1)
+
+
+def test_a_stage_whose_multiplier_is_zero_is_frozen() -> None:
+    simulator = tiny_simulator()
+    multipliers = {"encoder": 0.0, "dynamics": 1.0, "renderer": 0.0}
+    settings = WarmupCosineAdam(lr=1.0, stage_multipliers=multipliers, warmup_steps=0, final_share=1.0, **ADAM)
+    settings.freeze(simulator)
+    optimizer, _ = settings.build(simulator, max_steps=1)
+    assert [group["name"] for group in optimizer.param_groups] == ["dynamics"]
+    assert {name.split(".")[0] for name, each in simulator.named_parameters() if each.requires_grad} == {"dynamics"}
+
+
+def test_a_training_in_which_nothing_learns_is_refused() -> None:
+    multipliers = {"encoder": 0.0, "dynamics": 0.0, "renderer": 0.0}
+    settings = WarmupCosineAdam(lr=1.0, stage_multipliers=multipliers, warmup_steps=0, final_share=1.0, **ADAM)
+    with pytest.raises(ConfigError, match="Nothing learns: optimizer.stage_multipliers freezes"):
+        settings.freeze(tiny_simulator())
 
 
 def test_every_stage_has_a_multiplier_to_set_on_the_command_line() -> None:

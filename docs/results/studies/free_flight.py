@@ -6,6 +6,8 @@ truly is.
 
 - ``targets``: the network alone, from the true displacement of every particle.
 - ``ready``: from pixels, through an encoder and a renderer that have learned to draw from the true motion and stay.
+- ``stills``: from pixels, through an encoder and a renderer that have learned to draw single frames and stay
+  (``model=vpd_staged``): nothing but pixels teaches any stage.
 - ``own``: from pixels, encoder, network and renderer together, as in the paper.
 
 It also writes where the gradient of the pixels pushes a ball that stands still: the cosine between that and its true
@@ -40,7 +42,7 @@ TEST_SEED, NUM_TEST = 999, 32
 
 @dataclass(frozen=True)
 class Row:
-    """One training; the network is the paper's (10 steps, 128 wide) but for its 32 abstract nodes."""
+    """One training; the network is the paper's (10 steps, 128 wide) but for its number of abstract nodes."""
 
     link: str
     same_pixels: bool = True
@@ -53,8 +55,14 @@ class Row:
     rays_per_step: int = 1024
     message_passing_steps: int = 10
     update_features: bool = True
+    dynamics_rate: float = 3e-4
+    num_abstract_nodes: int = 32
+    r_s: float = 0.4
+    r_a_s: float = 0.8
+    edge_gain: float = 1.0
 
 
+STAGED = Row("stills", update_features=False, num_abstract_nodes=64, r_s=0.25, r_a_s=0.4, edge_gain=3.0)
 ROWS = {
     "targets": Row("targets"),
     "targets, two draws of pixels": Row("targets", same_pixels=False),
@@ -63,6 +71,10 @@ ROWS = {
     "ready renderer, wide kernels": Row("ready"),
     "ready renderer, narrow kernels": Row("ready", surface_scale=0.1),
     "ready renderer, wide kernels, features stay": Row("ready", update_features=False),
+    "renderer of stills": STAGED,
+    "renderer of stills, rate of 1e-3": replace(STAGED, dynamics_rate=1e-3),
+    "renderer of stills, features updated": replace(STAGED, update_features=True),
+    "renderer of stills, few abstract nodes": Row("stills", update_features=False),
     "own renderer, wide kernels": Row("own"),
     "own renderer, narrow kernels": Row("own", surface_scale=0.1),
 }
@@ -82,10 +94,11 @@ class Training:
             ),
             dynamics=HierarchicalGNNDynamics(
                 feature_dim=FEATURE_DIM, hidden_dim=128, message_passing_steps=row.message_passing_steps,
-                num_abstract_nodes=32, max_abstract_neighbors=2, r_s=0.4, r_a_s=0.8, location_scale=0.1,
-                feature_limit=1e4, neighbors_backend="auto", edge_capacity=None, max_abstract_edges_per_node=None,
-                compile=False, zero_init_decoders=row.zero_init, normalized_edges=row.normalized_edges,
-                aggregation=row.aggregation, update_features=row.update_features,
+                num_abstract_nodes=row.num_abstract_nodes, max_abstract_neighbors=2, r_s=row.r_s, r_a_s=row.r_a_s,
+                location_scale=0.1, feature_limit=1e4, neighbors_backend="auto", edge_capacity=None,
+                max_abstract_edges_per_node=None, compile=False, zero_init_decoders=row.zero_init,
+                normalized_edges=row.normalized_edges, edge_gain=row.edge_gain, aggregation=row.aggregation,
+                update_features=row.update_features,
             ),
             renderer=SplatRenderer(
                 feature_dim=FEATURE_DIM, color_features=True, background_frequencies=4, hidden_dim=96, num_layers=3,
@@ -98,15 +111,15 @@ class Training:
         self.optimizer = torch.optim.Adam(
             [
                 {"params": pictures, "lr": 2e-3},
-                {"params": list(self.simulator.dynamics.parameters()), "lr": 3e-4},
+                {"params": list(self.simulator.dynamics.parameters()), "lr": row.dynamics_rate},
             ]
         )
         self.rates = [group["lr"] for group in self.optimizer.param_groups]
 
     def learn_to_draw(self, num_updates: int) -> None:
-        """Train encoder and renderer on particles that are moved as the balls truly move."""
+        """Train encoder and renderer on particles that are moved as the balls truly move, or on single frames."""
         for step in range(num_updates):
-            flights = self.flights(step)
+            flights = self.flights(step, still=self.row.link == "stills")
             _, current = self.encoded(flights)
             true = flights.true_displacements(current.positions)
             states = [replace(current, positions=current.positions + moved) for moved in true.unbind(dim=1)]
@@ -136,8 +149,9 @@ class Training:
         torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), 1.0)
         self.optimizer.step()
 
-    def flights(self, step: int) -> Flights:
-        return SCENE.flights(self.seed, step, self.row.batch_size, self.row.num_steps, self.row.rays_per_step)
+    def flights(self, step: int, still: bool = False) -> Flights:
+        row = self.row
+        return SCENE.flights(self.seed, step, row.batch_size, row.num_steps, row.rays_per_step, still=still)
 
     def encoded(self, flights: Flights) -> tuple[Particles, Particles]:
         """Return previous and current particles; those that learn from targets have the colours as features."""
@@ -212,7 +226,7 @@ def trained(name: str, row: Row, num_updates: int) -> dict[str, Any]:
     """Train and measure one row; returns what is written of it."""
     start = time.process_time()
     training = Training(row, 0, num_updates)
-    if row.link == "ready":
+    if row.link in ("ready", "stills"):
         training.learn_to_draw(num_updates)
     curve = {}
     for step in range(num_updates):

@@ -29,6 +29,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "feature_limit": 1e4,
         "zero_init_decoders": False,
         "normalized_edges": False,
+        "edge_gain": 1.0,
         "aggregation": "sum",
         "update_features": True,
     },

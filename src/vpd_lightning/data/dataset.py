@@ -1,6 +1,6 @@
 """Training clips: two context frames and rays of the frames after them, drawn from (seed, step, sample index) alone."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,6 +73,8 @@ class ClipDataset(Dataset[ClipSample]):
     A sample is a clip of T + 2 frames of a trajectory: frames ``start`` and ``start + 1`` of the input views as
     context, and rays of frames ``start + 2 ... start + 1 + T`` of the target views with the colours seen along them.
     With ``load_future`` the input views' images of those frames come too.
+
+    ``share_done`` is asked how much of the training is done, where a clock ends it and ``max_steps`` does not tell.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class ClipDataset(Dataset[ClipSample]):
         start_frames: Sequence[int] | None,
         moving_rays: MovingRays | None,
         load_future: bool,
+        share_done: Callable[[], float] | None = None,
     ) -> None:
         """Check that every trajectory has the frames, views and image size that the clips need.
 
@@ -116,6 +119,7 @@ class ClipDataset(Dataset[ClipSample]):
         self.input_views, self.target_views = list(input_views), list(target_views)
         self.start_frames = None if start_frames is None else list(start_frames)
         self.moving_rays, self.load_future = moving_rays, load_future
+        self.share_done = share_done
         self._moving_pixels: dict[tuple[int, int], np.ndarray] = {}
         longest = max([num_steps, *(num_steps_schedule or {}).values()])
         require_clips(self.trajectories, longest, [*self.input_views, *self.target_views], self.start_frames)
@@ -123,9 +127,12 @@ class ClipDataset(Dataset[ClipSample]):
     def __len__(self) -> int:
         return self.max_steps * self.batch_size
 
+    def _share_done(self, step: int) -> float:
+        return step / self.max_steps if self.share_done is None else self.share_done()
+
     def __getitem__(self, item: int) -> ClipSample:
         step, sample_index = divmod(item, self.batch_size)
-        num_steps = steps_at(step / self.max_steps, self.num_steps, self.num_steps_schedule)
+        num_steps = steps_at(self._share_done(step), self.num_steps, self.num_steps_schedule)
         draw = numpy_generator(self.seed, step, sample_index, "clip")
         index = int(draw.integers(len(self.trajectories)))
         trajectory = self.trajectories[index]

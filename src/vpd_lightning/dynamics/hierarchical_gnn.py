@@ -61,7 +61,8 @@ class HierarchicalGNNDynamics(AbstractDynamics):
 
     ``zero_init_decoders`` starts the last layers of both decoders at zero, so that before training nothing moves and no
     feature changes. ``normalized_edges`` divides relative positions by the radius within which edges are drawn (``r_s``
-    or ``r_a_s``): the same functions, from inputs of order one whatever the scene's unit of length.
+    or ``r_a_s``): the same functions, from inputs of order one whatever the scene's unit of length. ``edge_gain``
+    multiplies those between particles and abstract nodes: a velocity is told by a shift of a fraction of ``r_s``.
 
     ``aggregation`` says how edges are brought together at a node: their ``sum``, or their ``mean``, whose size does not
     depend on how many particles lie around a node.
@@ -71,8 +72,8 @@ class HierarchicalGNNDynamics(AbstractDynamics):
     pictures by fading bodies, and does not learn how they move.
 
     # Paper: features are updated.
-    # Paper: neither of the first two; relative positions of a few centimetres are a hundredth of what the layers are
-    # initialised for. Its aggregation is not printed.
+    # Paper: neither zero_init_decoders nor normalized_edges; relative positions of a few centimetres are a hundredth of
+    # what the layers are initialised for. Its aggregation is not printed.
 
     ``last_uncovered_share`` is the share of current particles without abstract node in reach in the last call.
     """
@@ -98,6 +99,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         compile: bool,
         zero_init_decoders: bool,
         normalized_edges: bool,
+        edge_gain: float,
         aggregation: str,
         update_features: bool,
     ) -> None:
@@ -115,12 +117,20 @@ class HierarchicalGNNDynamics(AbstractDynamics):
                 raise ValueError(f"{name} must be at least 1, got {count}.")
         if message_passing_steps < 0:
             raise ValueError(f"message_passing_steps must be at least 0, got {message_passing_steps}.")
-        positive = {"r_s": r_s, "r_a_s": r_a_s, "location_scale": location_scale, "feature_limit": feature_limit}
+        positive = {
+            "r_s": r_s,
+            "r_a_s": r_a_s,
+            "location_scale": location_scale,
+            "feature_limit": feature_limit,
+            "edge_gain": edge_gain,
+        }
         for name, value in positive.items():
             if not value > 0:
                 raise ValueError(f"{name} must be greater than 0, got {value}.")
         if neighbors_backend not in ("auto", *BACKENDS):
             raise ValueError(f"neighbors_backend must be auto or one of {BACKENDS}, got {neighbors_backend!r}.")
+        if edge_gain != 1 and not normalized_edges:
+            raise ValueError(f"edge_gain={edge_gain} multiplies normalised edges: set normalized_edges=true.")
         if aggregation not in ("sum", "mean"):
             raise ValueError(f"aggregation must be sum or mean, got {aggregation!r}.")
         if compile and edge_capacity is None:
@@ -132,7 +142,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         self.neighbors_backend = neighbors_backend
         self.edge_capacity, self.max_abstract_edges_per_node = edge_capacity, max_abstract_edges_per_node
         self.is_compiled = compile
-        self.normalized_edges, self.aggregation = normalized_edges, aggregation
+        self.normalized_edges, self.edge_gain, self.aggregation = normalized_edges, float(edge_gain), aggregation
         self.last_uncovered_share = self.last_dropped_edges = None
         self._faults = DelayedFaults()
         widths = (hidden_dim, hidden_dim)
@@ -283,7 +293,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
                 positions[sender_type], edge_set.senders, -positions[receiver_type], edge_set.receivers
             )
             if self.normalized_edges:
-                relative = relative / (self.r_a_s if sender_type == receiver_type else self.r_s)
+                relative = relative / (self.r_a_s if sender_type == receiver_type else self.r_s / self.edge_gain)
             edges[name] = self.encode_edge[name](relative)
 
         # Update particle -> abstract edges, then abstract nodes.

@@ -17,7 +17,6 @@ from vpd_lightning.types import Cameras, Rays, RGBDFrames, VideoBatch
 
 RADIUS = 0.15
 GRAVITY = 0.004  # metres per step squared
-SPEED = 0.05  # metres per step along each axis, at most
 WORKSPACE_MIN, WORKSPACE_MAX = (-0.8, -0.8, -0.05), (0.8, 0.8, 1.0)
 NEAR, FAR = 0.3, 5.0
 
@@ -65,12 +64,20 @@ class FreeFlight:
     num_bodies: int = 2
     num_cameras: int = 3
     image_size: int = 32  # pixels, height and width
+    speed: float = 0.05  # metres per step along each axis, at most
 
-    def flights(self, seed: int, step: int, batch_size: int, num_steps: int, rays_per_step: int) -> Flights:
-        """Draw the batch of one training step: context frames of all cameras, and rays of the steps after them."""
+    def flights(
+        self, seed: int, step: int, batch_size: int, num_steps: int, rays_per_step: int, *, still: bool = False
+    ) -> Flights:
+        """Draw the batch of one training step: context frames of all cameras, and rays of the steps after them.
+
+        ``still``: all steps show the last context frame, as an auto-encoder needs it.
+        """
         keys = RandomKeys(seed=seed, step=step, sample_index=list(range(batch_size)))
         times = torch.arange(num_steps + 2)
         centers = torch.stack([self._centers(generator, times) for generator in keys.generators("flight")])
+        if still:
+            centers[:, 2:] = centers[:, 1:2]
         cameras = self._cameras()
         rays = pixel_rays(cameras)
         every = Rays(rays.origins.flatten(0, -2), rays.directions.flatten(0, -2))
@@ -112,7 +119,7 @@ class FreeFlight:
         middle = side * torch.tensor(_MIDDLES[: self.num_bodies])
         middle[:, 2] = middle[:, 2].abs()
         start = middle + _REACH * (2 * torch.rand(self.num_bodies, 3, generator=generator) - 1)
-        velocity = SPEED * (2 * torch.rand(self.num_bodies, 3, generator=generator) - 1)
+        velocity = self.speed * (2 * torch.rand(self.num_bodies, 3, generator=generator) - 1)
         elapsed = (times - 1).float()[:, None, None]
         fall = torch.tensor([0.0, 0.0, -0.5 * GRAVITY]) * elapsed.square()
         return start + velocity * elapsed + fall

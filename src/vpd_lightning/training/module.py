@@ -56,6 +56,7 @@ class VPDModule(pl.LightningModule):
         self.simulator = simulator
         self.losses = nn.ModuleList(losses)
         self.optimization = optimization
+        optimization.freeze(simulator)
         self.validation_metric = SampleMetric(metric(HEADLINE))
         self.validation_metric_last_step = SampleMetric(metric(HEADLINE), last_step_only=True)
         self.train_metrics: dict[str, Tensor | float] = {}

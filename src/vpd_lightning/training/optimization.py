@@ -9,9 +9,14 @@ import torch
 from torch import nn
 from torch.optim.lr_scheduler import LambdaLR
 
+from vpd_lightning.errors import ConfigError
+
 
 class AbstractOptimization(ABC):
-    """Adam with one learning rate per stage, all multiplied by ``lr_factor(step)``."""
+    """Adam with one learning rate per stage, all multiplied by ``lr_factor(step)``.
+
+    A multiplier of 0 freezes a stage.
+    """
 
     def __init__(
         self, *, lr: float, betas: Sequence[float], eps: float, stage_multipliers: Mapping[str, float]
@@ -24,6 +29,24 @@ class AbstractOptimization(ABC):
             raise ValueError(f"stage_multipliers must not be negative, got {dict(stage_multipliers)}")
         self.lr, self.betas, self.eps = lr, (float(betas[0]), float(betas[1])), eps
         self.stage_multipliers = dict(stage_multipliers)
+
+    def freeze(self, simulator: nn.Module) -> None:
+        """Freeze the stages whose multiplier is 0: else their gradients are computed, and count when they are clipped.
+
+        Before the model is given to several processes, which must know what learns.
+
+        Raises:
+            ConfigError: nothing is left that learns.
+        """
+        for name, stage in simulator.named_children():
+            if self.stage_multipliers.get(name) == 0:
+                stage.requires_grad_(False)
+        parameters = list(simulator.parameters())
+        if parameters and not any(parameter.requires_grad for parameter in parameters):
+            raise ConfigError(
+                "Nothing learns: optimizer.stage_multipliers freezes (0) every stage that has weights.\n"
+                "Give one of them a multiplier above 0."
+            )
 
     @abstractmethod
     def lr_factor(self, step: int, max_steps: int) -> float:

@@ -162,10 +162,30 @@ def test_without_a_limit_the_steps_end_it_and_the_time_is_written(data: Path, tm
     assert json.loads((tmp_path / FILE).read_text())["seconds"] == 4 * SECONDS_A_STEP
 
 
-def test_schedule_that_counts_steps_is_refused(data: Path, tmp_path: Path) -> None:
+class Lengths(pl.Callback):
+    """Notes the rollout length of every step."""
+
+    def __init__(self) -> None:
+        self.values: list[int] = []
+
+    def on_train_batch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, index: int) -> None:
+        self.values.append(batch.rgbs.shape[1])
+
+
+def test_clips_grow_with_the_share_of_the_time(data: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer(tmp_path, 1000, [ScriptedBudget(minutes=1.0), lengths := Lengths()])
+    trainer.fit(tiny_module(), tiny_data(data, num_steps_schedule={0.0: 1, 0.5: 3}, num_workers=0))
+
+    assert len(lengths.values) == 30
+    changed = lengths.values.index(3)
+    assert set(lengths.values[:changed]) == {1} and set(lengths.values[changed:]) == {3}
+    assert 15 <= changed <= 17  # batches are read one ahead
+
+
+def test_a_schedule_whose_data_other_processes_read_is_refused(data: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer(tmp_path, 10, [TimeBudget(minutes=1.0, clock="wall")])
-    with pytest.raises(ConfigError, match="num_steps_schedule"):
-        trainer.fit(tiny_module(), tiny_data(data))
+    with pytest.raises(ConfigError, match=r"(?s)num_steps_schedule follows the time.*Set data.num_workers=0"):
+        trainer.fit(tiny_module(), tiny_data(data, num_workers=2))
 
 
 def test_work_that_the_processors_clock_does_not_see_is_refused(data: Path, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Clips of single camera views, every start frame once in an epoch: what slot models are trained on."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +65,7 @@ class ViewClipDataset(Dataset[ViewSample]):
         resolution: int,
         cache: bool,
         slots: SlotStore | None,
+        share_done: Callable[[], float] | None = None,
     ) -> None:
         """Check that every trajectory has the frames, views and image size that the clips need.
 
@@ -83,6 +84,7 @@ class ViewClipDataset(Dataset[ViewSample]):
         self.num_history, self.num_steps, self.num_steps_schedule = num_history, num_steps, num_steps_schedule
         self.frame_offset, self.resolution = frame_offset, resolution
         self.views, self.cache, self.slots = list(views), cache, slots
+        self.share_done = share_done  # of the training, where a clock ends it and not a number of steps
         # Frames of the recording from the first to the last of the longest clip.
         span = (num_history + max([num_steps, *(num_steps_schedule or {}).values()]) - 1) * frame_offset + 1
         require_clips(self.trajectories, 0, self.views, start_frames, num_context_frames=span)
@@ -112,7 +114,8 @@ class ViewClipDataset(Dataset[ViewSample]):
         step, sample_index = divmod(item, self.batch_size)
         place = self.place(step, sample_index)
         trajectory = self.trajectories[place.trajectory]
-        count = self.num_history + steps_at(step / self.max_steps, self.num_steps, self.num_steps_schedule)
+        done = step / self.max_steps if self.share_done is None else self.share_done()
+        count = self.num_history + steps_at(done, self.num_steps, self.num_steps_schedule)
         times = range(place.start, place.start + count * self.frame_offset, self.frame_offset)
         return ViewSample(
             images=self._images(place.trajectory, place.view, times),

@@ -120,6 +120,7 @@ class ViewDataModule(VideoDataModule):
             resolution=self.resolution,
             cache=self.cache_images,
             slots=self.slots,
+            share_done=self.share_done,
         )
 
     def _collate(self) -> Callable[[Sequence[Any]], Any]:

@@ -60,18 +60,26 @@ class TimeBudget(pl.Callback):
         """Tell the module's schedule how long the training will be.
 
         Raises:
-            ConfigError: the rollout length is to change with the share of steps done, which nobody knows here; or the
-                clock does not see the work.
+            ConfigError: the rollout length is to change in the course of the training, and other processes read the
+                data; or the clock does not see the work.
         """
         if self.minutes is not None and self.clock == "cpu":
             self._require_work_on_the_clock(trainer)
         if self.minutes is not None and getattr(getattr(trainer, "datamodule", None), "num_steps_schedule", None):
-            raise ConfigError(
-                "data.num_steps_schedule counts steps, but callbacks.time_budget.minutes ends this training.\n"
-                "Set data.num_steps_schedule=null, or callbacks.time_budget.minutes=null."
-            )
+            self._lengthen_clips_by_time(trainer)
         if self.minutes is not None and isinstance(pl_module, VPDModule):
             pl_module.expected_steps = lambda: self.expected_steps(trainer.max_steps)
+
+    def _lengthen_clips_by_time(self, trainer: pl.Trainer) -> None:
+        """Give the data the share of the time that is used: how many updates there will be is not known."""
+        datamodule: Any = trainer.datamodule  # type: ignore[attr-defined]
+        if datamodule.num_workers:
+            raise ConfigError(
+                "data.num_steps_schedule follows the time that callbacks.time_budget.minutes allows, which the"
+                f" {datamodule.num_workers} processes that read data do not know.\n"
+                "Set data.num_workers=0, or data.num_steps_schedule=null."
+            )
+        datamodule.share_done = lambda: min(1.0, self.seconds / (self.seconds_allowed or 1.0))
 
     @staticmethod
     def _require_work_on_the_clock(trainer: pl.Trainer) -> None:
