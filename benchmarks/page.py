@@ -194,7 +194,18 @@ VIEWS: dict[str, Callable[[Any, Path], str]] = {
     "reading": _reading,
     "making": _making,
 }
-_OF_RESULTS = ("motion", "ablation", "recipes", "report", "sparsity", "first_velocity", "edits", "demo", "promises")
+_OF_RESULTS = (
+    "motion",
+    "ablation",
+    "recipes",
+    "report",
+    "sparsity",
+    "first_velocity",
+    "edits",
+    "demo",
+    "promises",
+    "vpd_motion",
+)
 VIEWS |= {name: getattr(page_tables, name) for name in (*_OF_RESULTS, "releases")}
 # How a view's file is read, where it is not the result of a suite.
 _READERS: dict[str, Callable[[Path], Any]] = dict.fromkeys(_OF_RESULTS, content_of)

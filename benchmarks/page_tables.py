@@ -1,7 +1,7 @@
 """Tables of ``docs/results`` and ``released`` for the pages; each takes what a file holds and where it lies."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ NAMES = {
     "noise": "location noise (`scene.location_noise=0.003`)",
     "no_warm_up": "no warm-up (`optimizer.warmup_steps=0`)",
 }
-SCENES = {"demo": "a tossed block", "deformable_collision": "two soft bodies", "movi_a": "rigid bodies"}
+SCENES = {"demo": "a tossed block", "mujoco_block": "a tossed block", "deformable_collision": "two soft bodies", "movi_a": "rigid bodies"}
 
 
 def motion(content: Mapping[str, Any], path: Path) -> str:
@@ -132,6 +132,41 @@ def demo(content: Mapping[str, Any], path: Path) -> str:
         f"by {100 * long['floor_drift']['max']:.2f} cm at most, and the block keeps its size ({size['min']:.2f} to "
         f"{size['max']:.2f} of that at the start)."
     )
+
+
+def vpd_motion(content: Mapping[str, Any], path: Path) -> str:
+    """Seeds of VPD on one data set: centroid errors beside what needs no learning, then pictures and size."""
+    steps = (1, 4, 8, 16, 32)
+    lines = _head(["centroid error (cm) after", *map(str, steps)], 1)
+    for name, row in content.items():
+        lines.append(
+            f"| {name} | " + _line(f"{row['centroid_error']['model'][str(step)]['mean']:.1f}" for step in steps)
+        )
+        cells = []
+        for step in steps:
+            found = row["difference"]["best_constant"][str(step)]
+            low, high = found["ci95"]
+            cells.append(f"{found['mean']:.1f} [{low:.1f}, {high:.1f}]")
+        lines.append(f"| {name}, less the best constant | " + _line(cells))
+    first = next(iter(content.values()))["centroid_error"]
+    for name in ("nothing_moves", "best_constant", "constant_velocity"):
+        cells = [f"{first[name][str(step)]['mean']:.1f}" for step in steps]
+        lines.append(f"| *{name.replace('_', ' ')}* | " + _line(cells))
+    pictures = ("psnr", "psnr_moving", "ssim")
+    titles = ["", "PSNR (dB)", "PSNR moving (dB)", "SSIM", "Chamfer (cm)", "size after 32 steps", "updates"]
+    lines += ["", *_head(titles, 1)]
+    for name, row in content.items():
+        cells = [f"{row[key]['model']:.{2 + (key == 'ssim')}f}" for key in pictures]
+        cells += [f"{100 * row['chamfer']:.1f}", f"{row['size_ratio']['32']['mean']:.2f}", f"{row['updates']:,}"]
+        lines.append(f"| {name} | " + _line(cells))
+    for name, title in {"copy_last": "*last frame*", "train_mean": "*mean image*"}.items():
+        cells = [f"{row[key][name]:.{2 + (key == 'ssim')}f}" for key in pictures]
+        lines.append(f"| {title} | " + _line([*cells, "", "", ""]))
+    return "\n".join(lines)
+
+
+def _line(cells: Iterable[str]) -> str:
+    return " | ".join(cells) + " |"
 
 
 def releases(content: None, path: Path) -> str:

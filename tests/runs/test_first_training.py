@@ -96,6 +96,22 @@ def test_second_training_starts_from_the_first_and_keeps_what_is_frozen(data: Pa
 
 
 @pytest.mark.slow
+def test_staged_vpd_learns_its_dynamics_by_pixels_through_what_the_first_training_left(
+    data: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    assert train(data, run, "model=vpd_staged", "callbacks.keep_checkpoints.every_n_steps=1") == 0
+
+    first = load_checkpoint(run / FOLDER / "checkpoints" / "last.ckpt")["state_dict"]
+    before, after = (
+        load_checkpoint(run / "checkpoints" / f"{name}.ckpt")["state_dict"] for name in ("last-previous", "last")
+    )
+    assert all(name.startswith("simulator.dynamics.") for name in after.keys() - first.keys())
+    assert all(torch.equal(after[name], value) for name, value in first.items())
+    assert not torch.equal(*(each["simulator.dynamics.decode_location.layers.3.weight"] for each in (before, after)))
+
+
+@pytest.mark.slow
 def test_run_that_ended_between_the_two_trainings_goes_on(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert train(data, run) == 0
