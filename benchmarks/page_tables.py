@@ -34,7 +34,12 @@ NAMES = {
     "noise": "location noise (`scene.location_noise=0.003`)",
     "no_warm_up": "no warm-up (`optimizer.warmup_steps=0`)",
 }
-SCENES = {"demo": "a tossed block", "mujoco_block": "a tossed block", "deformable_collision": "two soft bodies", "movi_a": "rigid bodies"}
+SCENES = {
+    "demo": "a tossed block",
+    "mujoco_block": "a tossed block",
+    "deformable_collision": "two soft bodies",
+    "movi_a": "rigid bodies",
+}
 
 
 def motion(content: Mapping[str, Any], path: Path) -> str:
