@@ -31,7 +31,7 @@ def write_evaluation(folder: Path, gain: float) -> None:
     pictures = {name: value for name in ("psnr", "psnr_moving", "ssim")}
     metrics = {
         "seed": 0, "checkpoint_sha256": "a", "data_sha256": "b", "step": 7, "training": {},
-        "protocol": {"num_bootstrap": 50}, "chamfer": {"mean": 0.02}, **pictures,
+        "protocol": {"num_bootstrap": 50}, "chamfer": {"mean": 0.02}, "long_rollout": None, **pictures,
         "references": {"copy_last": pictures, "train_mean": pictures},
     }  # fmt: skip
     (folder / "metrics.json").write_text(json.dumps(metrics))

@@ -47,6 +47,7 @@ def measured(folder: Path) -> dict[str, Any]:
         "updates": metrics["step"],
         "training": metrics["training"],
         "protocol": metrics["protocol"],
+        "long_rollout": metrics["long_rollout"],
         "centroid_error": {name: {str(step): at(values, step) for step in STEPS} for name, values in errors.items()},
         "difference": {
             name: {str(step): at(errors["model"] - errors[name], step) for step in STEPS} for name in REFERENCES
@@ -56,6 +57,7 @@ def measured(folder: Path) -> dict[str, Any]:
         **{
             name: {"model": metrics[name]["mean"], "input_views": metrics[name]["input_views"]}
             | {key: value[name]["mean"] for key, value in metrics["references"].items()}
+            | {f"{key}_input_views": value[name]["input_views"] for key, value in metrics["references"].items()}
             for name in ("psnr", "psnr_moving", "ssim")
         },
     }
