@@ -101,7 +101,8 @@ def dynamics_layers(model: HierarchicalGNNDynamics, counts: EdgeCounts, is_plain
     both = (counts.abstract, counts.current)
     layers += _edges(model.update_edge["abstract_to_current"], ties["current"], both, is_plain)
     layers += _mlp(model.update_node["current"].mlp, counts.current)
-    return layers + _mlp(model.decode_location, counts.current) + _mlp(model.decode_feature, counts.current)
+    decoders = [model.decode_location, model.decode_feature]
+    return layers + [layer for mlp in decoders if mlp is not None for layer in _mlp(mlp, counts.current)]
 
 
 def among_abstract_layers(model: HierarchicalGNNDynamics, counts: EdgeCounts, is_plain: bool = False) -> list[Layer]:

@@ -14,7 +14,7 @@ from benchmarks.arithmetic import TRAINING, dynamics_layers, edge_counts, encode
 from benchmarks.measuring import Options, Result, Row, copy_rate, device_peak, gemm_rate, interleaved, row
 from benchmarks.suites import neighbors as neighbors_suite
 from benchmarks.suites import scaling as scaling_suite
-from benchmarks.training_step import EDGES_PER_NODE, PAPER, TINY, Scale, Step
+from benchmarks.training_step import EDGES_PER_NODE, OTHER_RENDERERS, PAPER, TINY, Scale, Step
 from benchmarks.worlds import picture_rays, surface_particles, two_frames
 from vpd_lightning.graph.neighbors import PointIndex
 from vpd_lightning.randomness import RandomKeys
@@ -83,7 +83,8 @@ def train_step(options: Options) -> Result:
     for variant in variants:  # one after the other: two of them need not fit beside each other
         try:
             step = Step(variant, scale, options.device)
-            gradients = step()
+            step()
+            gradients = step.gradients()
             seconds = interleaved({"step": step}, options.repeats, options.device)["step"]
             peak = device_peak(step, options.device)
         except Exception as error:
@@ -95,7 +96,7 @@ def train_step(options: Options) -> Result:
         if variant == "plain":
             reference, plain_seconds = gradients, seconds
         error = None
-        if not variant.startswith("surface") and reference is not None:
+        if not variant.startswith(OTHER_RENDERERS) and reference is not None:
             error = float((gradients - reference).norm() / reference.norm())
         note = "gradients relative to plain" if error is not None else "another renderer"
         baseline = "" if variant == "plain" else "plain"

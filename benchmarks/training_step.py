@@ -16,6 +16,7 @@ from benchmarks.worlds import video_batch
 from vpd_lightning.dynamics import hierarchical_gnn
 from vpd_lightning.losses.pixel import PixelLoss
 from vpd_lightning.simulator import Simulator
+from vpd_lightning.training.optimization import StepDecayAdam
 from vpd_lightning.types import VideoBatch
 
 _LITERAL_DYNAMICS = {"hidden": "hidden_dim", "num_rounds": "message_passing_steps", "r_s": "r_s", "r_a_s": "r_a_s"}
@@ -50,6 +51,7 @@ TINY = Scale(
     {"num_coarse_samples": 8, "num_fine_samples": 8, "net_width": 16, "net_width_condition": 8, "num_neighbors": 4},
 )  # fmt: skip
 
+OTHER_RENDERERS = ("surface", "splat")  # another loss than the paper's renderer, so other gradients
 EDGES_PER_NODE = 256  # room for edges among abstract nodes where shapes are fixed; surfaces have 90 to 160
 
 
@@ -68,8 +70,8 @@ class LiteralStep:
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=0.0)
         self.last_loss = float("nan")
 
-    def __call__(self, watch: Stopwatch | None = None) -> Tensor:
-        """Take the step; return all gradients in one vector."""
+    def __call__(self, watch: Stopwatch | None = None) -> None:
+        """Take the step."""
         watch = watch or Stopwatch(self.device)
         self.optimizer.zero_grad(set_to_none=True)
         with watch.stage("forward"):
@@ -79,16 +81,15 @@ class LiteralStep:
         with watch.stage("optimiser"):
             self.optimizer.step()
         self.last_loss = float(loss.detach())
-        return torch.cat([p.grad.flatten() for p in self.model.parameters() if p.grad is not None]).double()
 
 
 class Step:
     """A training step of one variant.
 
     ``fast`` is our path with everything kept for the backward pass; ``plain`` the same weights on the plain path;
-    ``saving`` computes activations again instead of keeping them; ``bf16`` multiplies in bfloat16;
-    ``surface`` has the other renderer, ``surface_bf16`` in bfloat16; ``compiled``
-    gives the dynamics fixed shapes and, on a GPU, hands it to torch.compile (a CUDA graph), in bfloat16.
+    ``saving`` computes activations again instead of keeping them; ``bf16`` multiplies in bfloat16; ``surface`` and
+    ``splat`` have those renderers, with ``_bf16`` in bfloat16; ``compiled`` gives the dynamics fixed shapes and, on a
+    GPU, hands it to torch.compile (a CUDA graph), in bfloat16.
     """
 
     def __init__(self, variant: str, scale: Scale, device: torch.device) -> None:
@@ -96,19 +97,20 @@ class Step:
         self.simulator = build_simulator(variant, scale, device.type == "cuda").to(device).train()
         self.batch: VideoBatch = video_batch(scale.image, scale.steps, scale.rays).to(device)
         self.loss = PixelLoss(weight=1.0, coarse_weight=1.0)
-        # A rate of zero: all the work, and every repetition sees the same weights.
-        self.optimizer = torch.optim.Adam(self.simulator.parameters(), lr=0.0)
+        # A rate too low to change a weight: all the work, and every repetition sees the same weights.
+        adam = StepDecayAdam(lr=1e-30, betas=[0.9, 0.999], eps=1e-8, milestones=[], gamma=1.0)
+        self.optimizer = adam.build(self.simulator, max_steps=1)[0]
         self.last_loss = float("nan")
 
-    def __call__(self, watch: Stopwatch | None = None) -> Tensor:
-        """Take the step; return all gradients in one vector."""
+    def __call__(self, watch: Stopwatch | None = None) -> None:
+        """Take the step."""
         watch = watch or Stopwatch(self.device)
         with ExitStack() as stack:
             if self.variant == "plain":
                 stack.enter_context(plain(self.simulator, self.scale.steps))
             stack.enter_context(watched(self.simulator, watch))
             self.optimizer.zero_grad(set_to_none=True)
-            is_bf16 = self.variant in ("bf16", "compiled", "surface_bf16")
+            is_bf16 = self.variant.endswith("bf16") or self.variant == "compiled"
             with torch.autocast(self.device.type, torch.bfloat16) if is_bf16 else nullcontext():
                 with watch.stage("other"):
                     output = self.simulator(self.batch)
@@ -119,6 +121,9 @@ class Step:
             with watch.stage("optimiser"):
                 self.optimizer.step()
         self.last_loss = float(loss.detach())
+
+    def gradients(self) -> Tensor:
+        """Return all gradients of the last step in one vector."""
         return torch.cat([p.grad.flatten() for p in self.simulator.parameters() if p.grad is not None]).double()
 
 
@@ -127,8 +132,8 @@ def build_simulator(variant: str, scale: Scale, is_gpu: bool) -> Simulator:
     dynamics = {"num_abstract_nodes": scale.abstract_nodes, **(scale.dynamics or {})}
     option, renderer = "point_nerf", dict(scale.renderer or {})
     saves = variant == "saving"
-    if variant.startswith("surface"):
-        option, renderer = "surface", {}
+    if variant.startswith(OTHER_RENDERERS):
+        option, renderer = variant.removesuffix("_bf16"), {}
     else:
         renderer["checkpoint_chunks"] = saves
     if variant == "compiled":

@@ -3,16 +3,14 @@
 from collections import defaultdict
 from pathlib import Path
 
-from torch import Tensor
-
 from benchmarks import plots
 from benchmarks.arithmetic import TRAINING, Work, dynamics_layers, edge_counts, encoder_layers, renderer_layers, work
 from benchmarks.measuring import Options, Result, Row, Stopwatch, copy_rate, device_peak, gemm_rate, row
 from benchmarks.memory_probe import peak_of
 from benchmarks.plain.neighbors import SEARCH
-from benchmarks.training_step import SCALES, STAGES, LiteralStep, Step
+from benchmarks.training_step import OTHER_RENDERERS, SCALES, STAGES, LiteralStep, Step
 
-VARIANTS = ("plain", "fast", "saving", "bf16", "surface", "surface_bf16")
+VARIANTS = ("plain", "fast", "saving", "bf16", "surface", "surface_bf16", "splat", "splat_bf16")
 LITERAL = "literal"
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4  # relative; float32 sums in another order
 NOTES = {
@@ -22,6 +20,8 @@ NOTES = {
     "surface": "another renderer: another loss, so no error",
     LITERAL: "the paper in PyTorch without this package: other weights and draws, so no error",
     "surface_bf16": "another renderer, autocast to bfloat16: another loss, so no error",
+    "splat": "another renderer: another loss, so no error",
+    "splat_bf16": "another renderer, autocast to bfloat16: another loss, so no error",
 }
 
 
@@ -35,11 +35,10 @@ def run(options: Options) -> Result:
     steps = {variant: Step(variant, scale, options.device) for variant in VARIANTS}
     together = {**steps, LITERAL: LiteralStep(scale, options.device)}
     seconds: dict[str, dict[str, list[float]]] = {variant: defaultdict(list) for variant in together}
-    gradients: dict[str, Tensor] = {}
     for repeat in range(options.repeats + 1):  # the first round warms up
         for variant, step in together.items():
             watch = Stopwatch(options.device)
-            gradients[variant] = step(watch)
+            step(watch)
             if repeat:
                 for name in (*STAGES, "other"):
                     seconds[variant][name].append(watch.seconds.get(name, 0.0))
@@ -49,12 +48,12 @@ def run(options: Options) -> Result:
     )  # each takes a process of its own
     peaks = {variant: _peak(variant, step, options) if variant in probed else None for variant, step in steps.items()}
     rows = [row("train_step/plain", seconds["plain"]["step"], peak_bytes=peaks["plain"], note=f"{SEARCH} neighbours")]
-    reference = gradients["plain"]
+    reference = steps["plain"].gradients()
     for variant in VARIANTS[1:]:
         error = None
         note = NOTES[variant]
-        if not variant.startswith("surface"):
-            error = float((gradients[variant] - reference).norm() / reference.norm())
+        if not variant.startswith(OTHER_RENDERERS):
+            error = float((steps[variant].gradients() - reference).norm() / reference.norm())
             loss_error = abs(steps[variant].last_loss / steps["plain"].last_loss - 1)
             note += f"; gradients (error) and loss ({loss_error:.0e}) relative to plain"
             if variant in ("fast", "saving") and not (error < GRADIENT_TOLERANCE and loss_error < LOSS_TOLERANCE):

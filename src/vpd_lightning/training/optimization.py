@@ -52,7 +52,7 @@ class AbstractOptimization(ABC):
     def lr_factor(self, step: int, max_steps: int) -> float:
         """Return the factor on all learning rates for the update that follows ``step`` updates."""
 
-    def build(self, simulator: nn.Module, max_steps: int | Callable[[], int]) -> tuple[torch.optim.Adam, LambdaLR]:
+    def build(self, simulator: nn.Module, max_steps: int | Callable[[], int]) -> tuple[torch.optim.Optimizer, LambdaLR]:
         """Return the optimiser and its schedule, to be stepped after every update.
 
         ``max_steps`` is asked again for every update where it is a function: a training that ends after a given time
@@ -61,6 +61,13 @@ class AbstractOptimization(ABC):
         Stages are the direct children of the simulator; a stage without a multiplier has 1. Raises ValueError where a
         multiplier other than 1 names no stage.
         """
+        optimizer = self.optimizer(self.parameter_groups(simulator))
+        # A plain function: a scheduler writes the attributes of other callables into the checkpoint.
+        expected = max_steps if callable(max_steps) else lambda: max_steps
+        return optimizer, LambdaLR(optimizer, lambda step: self.lr_factor(step, expected()))
+
+    def parameter_groups(self, simulator: nn.Module) -> list[dict[str, Any]]:
+        """Return the weights that learn, one group for each stage, with ``lr`` and ``name``."""
         stages = dict(simulator.named_children())
         # Systems have different stages, and the default of 1 for the usual three concerns none of the others.
         unknown = sorted(name for name, value in self.stage_multipliers.items() if value != 1 and name not in stages)
@@ -74,10 +81,15 @@ class AbstractOptimization(ABC):
             if parameters:  # a frozen stage has none
                 rate = self.lr * self.stage_multipliers.get(name, 1.0)
                 groups.append({"params": parameters, "lr": rate, "name": name})
-        optimizer = torch.optim.Adam(groups, betas=self.betas, eps=self.eps)
-        # A plain function: a scheduler writes the attributes of other callables into the checkpoint.
-        expected = max_steps if callable(max_steps) else lambda: max_steps
-        return optimizer, LambdaLR(optimizer, lambda step: self.lr_factor(step, expected()))
+        return groups
+
+    def optimizer(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
+        """Build the optimiser of parameter groups."""
+        # One pass over each weight: three to six times as fast as the other forms.
+        adam = torch.optim.Adam(groups, betas=self.betas, eps=self.eps, fused=True)
+        # Lightning refuses to clip gradients before an optimiser that would unscale them itself; let it unscale them.
+        adam._step_supports_amp_scaling = False
+        return adam
 
 
 class StepDecayAdam(AbstractOptimization):
