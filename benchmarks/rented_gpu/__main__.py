@@ -1,0 +1,174 @@
+r"""Training on a rented GPU machine, in pieces of a few minutes.
+
+    # where the data and the whole project are
+    python -m benchmarks.rented_gpu pack --out pack.npz --updates 3000,20000 --limit-mib 12 \
+        experiment=mujoco_block model=vpd_staged budget=hour data.folder=DATA
+
+    # on the machine with the GPU: needs torch and what the package's core imports (numpy, h5py, scipy, jaxtyping)
+    python -m benchmarks.rented_gpu train --pack pack.npz --out OUT --minutes 9 [--resume OUT]
+
+    # back at home: a run folder for vpd-eval, vpd-view, vpd-export and pretraining.ckpt
+    python -m benchmarks.rented_gpu run --pack pack.npz --state OUT --folder RUN
+
+Words without dashes are those of vpd-train. ``pack`` takes as many training trajectories as fit. A model that is
+trained in two trainings needs two numbers of ``--updates``. ``train`` stops after its minutes, leaves at most seven
+files of 15 MiB and ``curve.json`` in ``--out``, and goes on from there with ``--resume``, there or elsewhere.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+RATES = {"cuda": 989.0, "cpu": 0.21}
+"""TFLOP/s in bfloat16: an H200's data sheet, dense; one core of an AMD EPYC with avx512_bf16, measured."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one of the commands; 1 where something is wrong with what it was given."""
+    from vpd_lightning.errors import VPDError
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    pack = commands.add_parser("pack", help="recordings and settings into one file")
+    pack.add_argument("--out", type=Path, required=True)
+    pack.add_argument("--updates", type=_counts, required=True, help="of each training, for example 3000,20000")
+    pack.add_argument("--limit-mib", type=float, default=12.0)
+    pack.add_argument("overrides", nargs="*", help="as for vpd-train")
+    pack.set_defaults(call=_pack)
+    train = commands.add_parser("train", help="train for some minutes")
+    train.add_argument("--pack", type=Path, required=True)
+    train.add_argument("--out", type=Path, required=True)
+    train.add_argument("--resume", type=Path, help="folder with the state to go on from")
+    train.add_argument("--minutes", type=float, default=9.0)
+    train.add_argument("--save-minutes", type=float, default=2.0)
+    train.add_argument("--device", default="cuda")
+    train.add_argument("--workers", type=int, default=8, help="processes that draw clips")
+    train.set_defaults(call=_train)
+    run = commands.add_parser("run", help="a run folder from a state")
+    run.add_argument("--pack", type=Path, required=True)
+    run.add_argument("--state", type=Path, required=True)
+    run.add_argument("--folder", type=Path, required=True)
+    run.set_defaults(call=_run)
+    options = parser.parse_args(arguments)
+    try:
+        options.call(options)
+    except VPDError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+def _counts(text: str) -> list[int]:
+    return [int(word) for word in text.split(",")]
+
+
+def _pack(options: argparse.Namespace) -> None:
+    from benchmarks.rented_gpu.packing import write_pack
+    from vpd_lightning.config import compose
+    from vpd_lightning.config.pretraining import pretraining_config
+    from vpd_lightning.data.frames import TrajectoryFrames
+    from vpd_lightning.data.manifest import load_manifest
+    from vpd_lightning.errors import ConfigError
+
+    config = compose("train", ["run.folder=unused", *options.overrides])
+    first = pretraining_config(config)
+    configs = [config] if first is None else [first, config]
+    if len(options.updates) != len(configs) or min(options.updates) < 1:
+        raise ConfigError(f"--updates needs {len(configs)} numbers above 0, one for each training of this model.")
+    manifest = load_manifest(config["data"]["folder"])
+    files = manifest.split("train")[: config["data"]["num_trajectories"]]
+    trajectories = [TrajectoryFrames(path, use_cache=False) for path in files]
+    targets = config["data"]["target_views"]
+    targets = list(range(trajectories[0].num_views)) if targets is None else targets
+    phases = [_phase(one, count, targets) for one, count in zip(configs, options.updates, strict=True)]
+    fitted, size = write_pack(
+        options.out,
+        {"phases": phases, "config": config},
+        trajectories,
+        manifest.checksums(files),
+        input_views=config["data"]["input_views"],
+        target_views=targets,
+        limit_bytes=int(options.limit_mib * 2**20),
+    )
+    print(f"{options.out}: {fitted} of {len(files)} training trajectories, {size / 2**20:.2f} MiB")
+
+
+def _phase(config: dict[str, Any], updates: int, target_views: list[int]) -> dict[str, Any]:
+    """Return what one training needs of its configuration.
+
+    Raises:
+        ConfigError: it needs something that the loop does not offer.
+    """
+    from benchmarks.rented_gpu.training import CLIPS, STAGES
+    from vpd_lightning.errors import ConfigError
+
+    if not all(config.get(name) for name in STAGES):
+        raise ConfigError("Only systems of encoder, dynamics and renderer can be trained so.\nUse vpd-train.")
+    if config["encoder"].get("background") or config["data"]["moving_ray_fraction"]:
+        raise ConfigError(
+            "Backgrounds and moving rays need the whole training split.\n"
+            "Set encoder.background=null and data.moving_ray_fraction=0, or use vpd-train."
+        )
+    data = {name: config["data"][name] for name in CLIPS} | {"target_views": target_views}
+    sections = {name: config[name] for name in (*STAGES, "model", "loss", "optimizer", "seed")}
+    trainer = {name: config["trainer"].get(name) for name in ("precision", "gradient_clip_val")}
+    return {**sections, "data": data, "trainer": trainer, "updates": updates}
+
+
+def _train(options: argparse.Namespace) -> None:
+    import torch
+
+    from benchmarks.rented_gpu.packing import read_pack
+    from benchmarks.rented_gpu.progress import Progress, read_progress
+    from benchmarks.rented_gpu.training import Training
+
+    deadline = time.perf_counter() + 60 * options.minutes
+    settings, trajectories = read_pack(options.pack)
+    print(f"{len(trajectories)} trajectories unpacked", flush=True)
+    progress = read_progress(options.resume) if options.resume else Progress()
+    training = Training(settings["phases"], trajectories, torch.device(options.device), options.workers, progress)
+    before = (progress.seconds, len(progress.curve))
+    training.run(deadline, options.out, 60 * options.save_minutes)
+    seconds, points = progress.seconds - before[0], progress.curve[before[1] :]
+    for point in points[:: max(1, len(points) // 20)]:
+        print("  ".join(f"{name} {value:.5g}" for name, value in point.items()))
+    where = "done" if training.is_done else f"phase {progress.phase}, update {progress.step}"
+    print(f"{where}; {seconds:.1f} s of updates now, {progress.seconds:.1f} s in all")
+    if training.operations:
+        floor = training.operations / (RATES[training.device.type] * 1e12)
+        print(f"{training.operations / 1e12:.3f} TFLOP an update; its floor is {floor:.3f} s")
+    if training.device.type == "cuda":
+        print(f"{torch.cuda.get_device_name()}: {torch.cuda.max_memory_allocated() / 2**30:.1f} GiB at most")
+
+
+def _run(options: argparse.Namespace) -> None:
+    from benchmarks.rented_gpu.packing import read_settings
+    from benchmarks.rented_gpu.progress import read_progress
+    from benchmarks.rented_gpu.training import build_system
+    from vpd_lightning.data.trained_on import TRAINED_ON
+    from vpd_lightning.errors import CheckpointError
+    from vpd_lightning.training.checkpoint_files import LAST, write_checkpoint
+
+    settings, progress = read_settings(options.pack), read_progress(options.state)
+    last = build_system(settings["phases"][-1])
+    missing = sorted(set(last.state_dict()) - set(progress.weights))
+    if missing:
+        raise CheckpointError(
+            f"{options.state} stands in phase {progress.phase} and has no {missing[0]} yet.\n"
+            "Train until the last phase."
+        )
+    path = options.folder / "checkpoints" / LAST
+    content = {
+        "state_dict": {f"simulator.{name}": progress.weights[name] for name in last.state_dict()},
+        "hyper_parameters": settings["config"],
+        "global_step": progress.step,
+        TRAINED_ON: settings["checksums"],
+    }
+    write_checkpoint(content, path)
+    print(path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

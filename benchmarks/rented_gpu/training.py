@@ -1,0 +1,186 @@
+"""The training loop on torch alone: the project's stages, losses, clips and optimiser, without Hydra and Lightning."""
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+from torch.utils.flop_counter import FlopCounterMode
+
+from benchmarks.rented_gpu.packing import PackedTrajectory
+from benchmarks.rented_gpu.progress import Progress, adam_second_moments, restore_adam, write_progress
+from vpd_lightning.data.collate import collate_clips
+from vpd_lightning.data.dataset import ClipDataset
+from vpd_lightning.data.sampler import StepBatchSampler
+from vpd_lightning.errors import NonFiniteError
+from vpd_lightning.randomness import derive_seed
+from vpd_lightning.types import VideoBatch
+
+STAGES = ("encoder", "dynamics", "renderer")
+CLIPS = (
+    "seed", "batch_size", "num_steps", "num_steps_schedule", "rays_per_step", "input_views", "target_views",
+    "start_frames", "load_future",
+)  # fmt: skip
+
+
+def build(section: Any, **more: Any) -> Any:
+    """Build what a resolved section describes by ``_target_``, sections inside of it first."""
+    if isinstance(section, list):
+        return [build(item) for item in section]
+    if not isinstance(section, Mapping):
+        return section
+    values = {key: build(item) for key, item in section.items() if key != "_target_"}
+    if "_target_" not in section:
+        return values
+    module, _, kind = str(section["_target_"]).rpartition(".")
+    return getattr(import_module(module), kind)(**values, **more)
+
+
+def build_system(config: Mapping[str, Any]) -> nn.Module:
+    """Build the system with the same initial weights as ``vpd-train`` gives it."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive_seed(config["seed"], "weights"))
+        return build(config["model"], **{name: build(config[name]) for name in STAGES})
+
+
+class Training:
+    """Takes a training through its phases until a deadline.
+
+    Args:
+        phases: plain settings of each training, and its number of ``updates``.
+        trajectories: what clips are drawn from.
+        device: of the networks.
+        num_workers: processes that draw the clips.
+        progress: where to go on.
+    """
+
+    def __init__(
+        self,
+        phases: Sequence[Mapping[str, Any]],
+        trajectories: Sequence[PackedTrajectory],
+        device: torch.device,
+        num_workers: int,
+        progress: Progress,
+    ) -> None:
+        self.phases, self.trajectories, self.device = phases, trajectories, device
+        self.num_workers, self.progress = num_workers, progress
+        self._begin()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all updates of all phases are taken."""
+        return self.progress.phase == len(self.phases)
+
+    def run(self, deadline: float, out: Path, seconds_per_save: float) -> None:
+        """Train until ``time.perf_counter()`` reaches the deadline, and leave the state in ``out``."""
+        saved = time.perf_counter()
+        while not self.is_done and time.perf_counter() < deadline:
+            for batch in self._batches():
+                self._update(batch)
+                now = time.perf_counter()
+                if now - saved > seconds_per_save:
+                    self.save(out)
+                    saved = now
+                if now >= deadline or self.progress.step == self.phases[self.progress.phase]["updates"]:
+                    break
+            if self.progress.step == self.phases[self.progress.phase]["updates"]:
+                self._next_phase()
+        self.save(out)
+
+    def save(self, out: Path) -> None:
+        """Write the state."""
+        names = {weight: name for name, weight in self.system.named_parameters()}
+        self.progress.weights = {name: value.detach() for name, value in self.system.state_dict().items()}
+        self.progress.second_moments = adam_second_moments(self.optimizer, names)
+        write_progress(out, self.progress)
+
+    def _begin(self) -> None:
+        """Build the system of the current phase with the weights there are, as far as it has a place for them."""
+        config = self.phases[min(self.progress.phase, len(self.phases) - 1)]
+        self.operations: int | None = None  # floating-point operations of an update, once one was taken
+        self.system = build_system(config).to(self.device).train()
+        own = self.system.state_dict()
+        known = {name: value for name, value in self.progress.weights.items() if name in own}
+        self.system.load_state_dict(known, strict=False)
+        self.losses = [build(section) for section in config["loss"].values() if section is not None]
+        self.optimization = build(config["optimizer"])
+        self.optimization.freeze(self.system)
+        self.optimizer, _ = self.optimization.build(self.system, config["updates"])
+        self._rates = [group["initial_lr"] for group in self.optimizer.param_groups]
+        named = dict(self.system.named_parameters())
+        moments = {name: value for name, value in self.progress.second_moments.items() if name in named}
+        restore_adam(self.optimizer, named, moments, self.progress.step)
+        self.clip = config["trainer"].get("gradient_clip_val")
+        precision = config["trainer"].get("precision")
+        self.is_bf16 = precision == "bf16-mixed" or (precision == "auto" and self.device.type == "cuda")
+
+    def _next_phase(self) -> None:
+        self.progress.weights = {name: value.detach() for name, value in self.system.state_dict().items()}
+        self.progress.second_moments = {}
+        self.progress.phase, self.progress.step = self.progress.phase + 1, 0
+        if not self.is_done:
+            self._begin()
+
+    def _batches(self) -> DataLoader[VideoBatch]:
+        config = self.phases[self.progress.phase]
+        clips = ClipDataset(
+            trajectories=self.trajectories,
+            max_steps=config["updates"],
+            moving_rays=None,
+            **{name: config["data"][name] for name in CLIPS},
+        )
+        sampler = StepBatchSampler(
+            batch_size=clips.batch_size,
+            max_steps=config["updates"],
+            rank=0,
+            world_size=1,
+            first_step=lambda: self.progress.step,
+        )
+        return DataLoader(
+            clips,
+            batch_sampler=sampler,
+            collate_fn=collate_clips,
+            num_workers=self.num_workers,
+            pin_memory=self.device.type == "cuda",
+        )
+
+    def _backward(self, batch: VideoBatch) -> Tensor:
+        """Compute the gradients of a batch; return its loss."""
+        with torch.autocast(self.device.type, torch.bfloat16) if self.is_bf16 else nullcontext():
+            output = self.system(batch)
+            loss = torch.stack([part.weight * part(output, batch) for part in self.losses]).sum()
+        loss.backward()
+        return loss.detach()
+
+    def _update(self, batch: VideoBatch) -> None:
+        progress, config = self.progress, self.phases[self.progress.phase]
+        start = time.perf_counter()
+        batch = batch.to(self.device)
+        factor = self.optimization.lr_factor(progress.step, config["updates"])
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = rate * factor
+        self.optimizer.zero_grad(set_to_none=True)
+        if self.operations is None:  # of the first update, with what is computed again in the backward pass
+            with FlopCounterMode(display=False) as counter:
+                loss = self._backward(batch)
+            self.operations = counter.get_total_flops()
+        else:
+            loss = self._backward(batch)
+        weights = [weight for weight in self.system.parameters() if weight.grad is not None]
+        norm = nn.utils.clip_grad_norm_(weights, self.clip or float("inf"))
+        values = torch.stack([loss.float(), norm.float()]).tolist()
+        if not all(value < float("inf") for value in values):  # NaN, too
+            place = f"phase {progress.phase}, update {progress.step}"
+            raise NonFiniteError(f"Loss {values[0]}, gradient {values[1]} in {place}.\nGo on from the last state.")
+        self.optimizer.step()
+        progress.step += 1
+        progress.seconds += time.perf_counter() - start
+        point = {"loss": values[0], "gradient_norm": values[1], "lr": self._rates[0] * factor}
+        where = {"phase": progress.phase, "step": progress.step, "seconds": round(progress.seconds, 2)}
+        if progress.step % 10 == 0 or progress.step == 1:
+            progress.curve.append(where | point)
