@@ -7,6 +7,7 @@ from typing import Any
 import lightning.pytorch as pl
 from lightning.pytorch.callbacks import Checkpoint
 
+from vpd_lightning.free_memory import return_free_memory
 from vpd_lightning.training.checkpoint_files import BEST, LAST
 from vpd_lightning.training.checkpoints import FOLDER
 from vpd_lightning.training.module import BEST_METRIC
@@ -63,6 +64,7 @@ class KeepCheckpoints(Checkpoint):
         """Write ``last.ckpt`` now."""
         save_checkpoint(trainer, LAST)
         self._saved_step = trainer.global_step
+        return_free_memory()  # here because it is as often as a training may pause
 
     def _is_due(self, trainer: pl.Trainer) -> bool:
         step = trainer.global_step
