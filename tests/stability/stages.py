@@ -56,6 +56,12 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {  # switches that change how a
     "hierarchical_gnn": {
         "static_shapes": {"edge_capacity": 512},
         "nearest_abstract_nodes": {"max_abstract_edges_per_node": 4},
+        "as_vpd_staged": {
+            "normalized_edges": True,
+            "edge_gain": 3.0,
+            "aggregation": "mean",
+            "update_features": False,
+        },
     },
 }
 

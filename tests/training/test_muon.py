@@ -137,3 +137,18 @@ def test_a_closure_is_called_once():
 def test_numbers_out_of_range_are_refused(changes: dict[str, float]):
     with pytest.raises(ValueError, match="muon_lr must be above 0 and muon_momentum in"):
         muon(**changes)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e15])
+def test_gradients_of_any_size_leave_finite_weights(size: float):
+    """A matrix that no clip of a batch reaches has a gradient of zero, which has no direction."""
+    model = system()
+    optimizer, _ = muon().build(model, max_steps=10)
+    before = [weight.detach().clone() for weight in model.parameters()]
+    for weight in model.parameters():
+        weight.grad = torch.full_like(weight, size)
+    optimizer.step()
+
+    for weight, was in zip(model.parameters(), before, strict=True):
+        assert weight.isfinite().all()
+        assert size > 0 or torch.equal(weight, was)
