@@ -4,7 +4,7 @@ r"""Training on a rented GPU machine, in pieces of a few minutes.
     python -m benchmarks.rented_gpu pack --out pack.npz --updates 3000,20000 --limit-mib 12 \
         experiment=mujoco_block model=vpd_staged budget=hour data.folder=DATA
 
-    # on the machine with the GPU: needs torch and what the package's core imports (numpy, h5py, scipy, jaxtyping)
+    # on the machine with the GPU: needs torch and what the core imports (numpy, scipy, jaxtyping)
     python -m benchmarks.rented_gpu train --pack pack.npz --out OUT --minutes 9 [--resume OUT]
 
     # back at home: a run folder for vpd-eval, vpd-view, vpd-export and pretraining.ckpt
@@ -68,6 +68,7 @@ def _pack(options: argparse.Namespace) -> None:
     from benchmarks.rented_gpu.packing import write_pack
     from vpd_lightning.config import compose
     from vpd_lightning.config.pretraining import pretraining_config
+    from vpd_lightning.data.background import median_images
     from vpd_lightning.data.frames import TrajectoryFrames
     from vpd_lightning.data.manifest import load_manifest
     from vpd_lightning.errors import ConfigError
@@ -83,13 +84,15 @@ def _pack(options: argparse.Namespace) -> None:
     targets = config["data"]["target_views"]
     targets = list(range(trajectories[0].num_views)) if targets is None else targets
     phases = [_phase(one, count, targets) for one, count in zip(configs, options.updates, strict=True)]
+    views = sorted({*config["data"]["input_views"], *targets})
     fitted, size = write_pack(
         options.out,
         {"phases": phases, "config": config},
         trajectories,
         manifest.checksums(files),
+        views=views,
+        base=median_images(trajectories, views),
         input_views=config["data"]["input_views"],
-        target_views=targets,
         limit_bytes=int(options.limit_mib * 2**20),
     )
     print(f"{options.out}: {fitted} of {len(files)} training trajectories, {size / 2**20:.2f} MiB")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from vpd_lightning.data.frame_source import FrameSource
 from vpd_lightning.errors import DataError
 
 SETTINGS = "settings"
@@ -23,7 +24,7 @@ _PRESET = 6  # of lzma; 9 saves a hundredth and takes twice as long
 
 @dataclass(frozen=True)
 class PackedTrajectory:
-    """One recording in memory, with the face of ``data.frames.TrajectoryFrames``; only its packed views have pixels."""
+    """One recording in memory; only its packed views have pixels."""
 
     path: Path
     packed_rgb: Mapping[int, UInt8[np.ndarray, "time height width 3"]]  # by view
@@ -68,11 +69,12 @@ class PackedTrajectory:
 def write_pack(
     path: Path,
     settings: Mapping[str, Any],
-    trajectories: Sequence[Any],
+    trajectories: Sequence[FrameSource],
     checksums: Sequence[str],
     *,
+    views: Sequence[int],
+    base: tuple[UInt8[np.ndarray, "view height width 3"], Float32[np.ndarray, "view height width"]],
     input_views: Sequence[int],
-    target_views: Sequence[int],
     limit_bytes: int,
 ) -> tuple[int, int]:
     """Write settings and as many trajectories as fit into ``limit_bytes``; return how many fitted and the file's size.
@@ -80,19 +82,17 @@ def write_pack(
     Args:
         path: of the file.
         settings: plain values, for ``training``.
-        trajectories: what has the face of ``data.frames.TrajectoryFrames``; their cameras stand still and are the same.
+        trajectories: with cameras that stand still and are the same for all.
         checksums: SHA-256 of each trajectory's file.
-        input_views: cameras whose colours and depth are packed.
-        target_views: cameras whose colours are packed.
+        views: cameras whose colours are packed.
+        base: colours and depth (metres) that these cameras mostly see.
+        input_views: cameras whose depth is packed, too.
         limit_bytes: at most so many bytes are written.
 
     Raises:
-        DataError: cameras move or differ, or not even one trajectory fits.
+        DataError: not even one trajectory fits.
     """
-    from vpd_lightning.data.background import median_images
-
-    views = sorted({*input_views, *target_views})
-    base_rgb, base_depth = median_images(trajectories, views)  # checks the cameras
+    base_rgb, base_depth = base
     intrinsics, cam_to_world = (part[0] for part in trajectories[0].cameras([0], range(trajectories[0].num_views)))
     arrays: dict[str, Any] = {
         "views": np.asarray(views),
@@ -105,7 +105,7 @@ def write_pack(
     size = sum(values.nbytes + _OVERHEAD for values in arrays.values()) + len(json.dumps(settings)) + _OVERHEAD
     fitted = 0
     for trajectory in trajectories:
-        packed = _packed(trajectory, views, sorted(set(input_views)), base_rgb, base_depth)
+        packed = _packed(trajectory, views, sorted(input_views), base_rgb, base_depth)
         needed = len(packed) + _OVERHEAD
         if size + needed > limit_bytes:
             break
@@ -116,7 +116,7 @@ def write_pack(
         raise DataError(f"Not one trajectory fits into {limit_bytes:,} bytes.\nRaise --limit-mib, or pack fewer views.")
     content = {
         **settings,
-        "input_views": sorted(set(input_views)),
+        "input_views": sorted(input_views),
         "checksums": list(checksums[:fitted]),
         "names": [f"{t.path.parent.name}/{t.path.name}" for t in trajectories[:fitted]],
     }
@@ -150,7 +150,7 @@ def read_pack(path: Path) -> tuple[dict[str, Any], list[PackedTrajectory]]:
 
 
 def _packed(
-    trajectory: Any,
+    trajectory: FrameSource,
     views: Sequence[int],
     with_depth: Sequence[int],
     base_rgb: UInt8[np.ndarray, "view height width 3"],

@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter
 from torch.utils.data import Dataset
 
 from vpd_lightning.data.collate import ClipSample
-from vpd_lightning.data.frames import Frames
+from vpd_lightning.data.frame_source import FrameSource
 from vpd_lightning.errors import DataError
 from vpd_lightning.geometry.cameras import rays_through
 from vpd_lightning.randomness import numpy_generator
@@ -80,7 +80,7 @@ class ClipDataset(Dataset[ClipSample]):
     def __init__(
         self,
         *,
-        trajectories: Sequence[Frames],
+        trajectories: Sequence[FrameSource],
         seed: int,
         batch_size: int,
         max_steps: int,
@@ -199,7 +199,7 @@ class ClipDataset(Dataset[ClipSample]):
 
 
 def require_clips(
-    trajectories: Sequence[Frames],
+    trajectories: Sequence[FrameSource],
     num_steps: int,
     views: Sequence[int],
     start_frames: Sequence[int] | None,
