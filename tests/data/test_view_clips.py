@@ -115,7 +115,7 @@ def test_epochs_of_the_paper_are_so_many_steps(
     num_trajectories: int, views: int, frames: int, num_history: int, num_steps: int, epochs: int, steps: int
 ) -> None:
     class Unread(TrajectoryFrames):
-        path, num_frames, num_views, height, width = Path("any.h5"), frames, views, 128, 128
+        path, num_frames, num_views, height, width, use_cache = Path("any.h5"), frames, views, 128, 128, False
 
         def __init__(self) -> None:
             """Of the paper's size; nothing is read."""
