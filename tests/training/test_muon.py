@@ -106,6 +106,15 @@ def test_a_resumed_optimiser_takes_the_same_steps():
         torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
+def test_without_a_rate_for_matrices_adam_steps_all_weights():
+    ours, theirs = system(), system()
+    optimizer, _ = muon(muon_lr=None).build(ours, max_steps=10)
+    adam, _ = WarmupCosineAdam(**SETTINGS).build(theirs, max_steps=10)
+
+    for one, other in zip(trained(ours, optimizer, range(3)), trained(theirs, adam, range(3)), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
 def test_both_rates_follow_one_schedule():
     model = system()
     optimizer, schedule = muon(warmup_steps=2, final_share=0.1).build(model, max_steps=6)
@@ -135,7 +144,7 @@ def test_a_closure_is_called_once():
 
 @pytest.mark.parametrize("changes", [{"muon_lr": 0.0}, {"muon_momentum": 1.0}])
 def test_numbers_out_of_range_are_refused(changes: dict[str, float]):
-    with pytest.raises(ValueError, match="muon_lr must be above 0 and muon_momentum in"):
+    with pytest.raises(ValueError, match="muon_lr must be above 0 or null and muon_momentum in"):
         muon(**changes)
 
 

@@ -18,7 +18,7 @@ MIN_WIDTH = 16
 
 
 class WarmupCosineMuon(WarmupCosineAdam):
-    """``WarmupCosineAdam`` with Muon, at ``muon_lr``, for matrices of at least 16 rows and columns.
+    """``WarmupCosineAdam`` with Muon, at ``muon_lr``, for matrices of at least 16 rows and columns; null: Adam for all.
 
     Both rates follow the same schedule and the same multipliers. Muon's step has the root mean square that Adam's
     would have (PyTorch's ``match_rms_adamw``), so that rates can be compared; no weight decay.
@@ -30,7 +30,7 @@ class WarmupCosineMuon(WarmupCosineAdam):
         self,
         *,
         lr: float,
-        muon_lr: float,
+        muon_lr: float | None,
         muon_momentum: float,
         betas: Sequence[float],
         eps: float,
@@ -46,12 +46,16 @@ class WarmupCosineMuon(WarmupCosineAdam):
             warmup_steps=warmup_steps,
             final_share=final_share,
         )
-        if muon_lr <= 0 or not 0.0 <= muon_momentum < 1.0:
-            raise ValueError(f"muon_lr must be above 0 and muon_momentum in [0, 1), got {muon_lr} and {muon_momentum}")
+        if (muon_lr is not None and muon_lr <= 0) or not 0.0 <= muon_momentum < 1.0:
+            raise ValueError(
+                f"muon_lr must be above 0 or null and muon_momentum in [0, 1), got {muon_lr} and {muon_momentum}"
+            )
         self.muon_lr, self.muon_momentum = muon_lr, muon_momentum
 
     def optimizer(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
         """Build Muon for the matrices of the groups and Adam for their other weights."""
+        if self.muon_lr is None:
+            return super().optimizer(groups)
         divided = []
         for group in groups:
             matrices = [p for p in group["params"] if p.ndim == 2 and min(p.shape) >= MIN_WIDTH]
