@@ -4,7 +4,7 @@ r"""Training on a rented GPU machine, in pieces of a few minutes.
     python -m benchmarks.rented_gpu pack --out pack.npz --updates 3000,20000 --limit-mib 12 \
         experiment=mujoco_block model=vpd_staged budget=hour data.folder=DATA
 
-    # on the machine with the GPU: needs torch and what the core imports (numpy, scipy, jaxtyping)
+    # on the machine with the GPU: needs torch and what the core imports (numpy, scipy, jaxtyping); PYTHONPATH=.:src
     python -m benchmarks.rented_gpu train --pack pack.npz --out OUT --minutes 9 [--resume OUT]
 
     # back at home: a run folder for vpd-eval, vpd-view, vpd-export and pretraining.ckpt
@@ -20,9 +20,6 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
-
-RATES = {"cuda": 989.0, "cpu": 0.21}
-"""TFLOP/s in bfloat16: an H200's data sheet, dense; one core of an AMD EPYC with avx512_bf16, measured."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -138,10 +135,8 @@ def _train(options: argparse.Namespace) -> None:
     for point in points[:: max(1, len(points) // 20)]:
         print("  ".join(f"{name} {value:.5g}" for name, value in point.items()))
     where = "done" if training.is_done else f"phase {progress.phase}, update {progress.step}"
-    print(f"{where}; {seconds:.1f} s of updates now, {progress.seconds:.1f} s in all")
-    if training.operations:
-        floor = training.operations / (RATES[training.device.type] * 1e12)
-        print(f"{training.operations / 1e12:.3f} TFLOP an update; its floor is {floor:.3f} s")
+    each = seconds / max(1, training.num_taken)
+    print(f"{where}; {seconds:.1f} s of updates now ({each:.3f} s each), {progress.seconds:.1f} s in all")
     if training.device.type == "cuda":
         print(f"{torch.cuda.get_device_name()}: {torch.cuda.max_memory_allocated() / 2**30:.1f} GiB at most")
 

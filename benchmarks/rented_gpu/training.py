@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
-from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.rented_gpu.packing import PackedTrajectory
 from benchmarks.rented_gpu.progress import Progress, adam_second_moments, restore_adam, write_progress
@@ -69,6 +68,7 @@ class Training:
     ) -> None:
         self.phases, self.trajectories, self.device = phases, trajectories, device
         self.num_workers, self.progress = num_workers, progress
+        self.num_taken = 0  # updates of this object
         self._begin()
 
     @property
@@ -102,7 +102,6 @@ class Training:
     def _begin(self) -> None:
         """Build the system of the current phase with the weights there are, as far as it has a place for them."""
         config = self.phases[min(self.progress.phase, len(self.phases) - 1)]
-        self.operations: int | None = None  # floating-point operations of an update, once one was taken
         self.system = build_system(config).to(self.device).train()
         own = self.system.state_dict()
         known = {name: value for name, value in self.progress.weights.items() if name in own}
@@ -165,12 +164,7 @@ class Training:
         for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
             group["lr"] = rate * factor
         self.optimizer.zero_grad(set_to_none=True)
-        if self.operations is None:  # of the first update, with what is computed again in the backward pass
-            with FlopCounterMode(display=False) as counter:
-                loss = self._backward(batch)
-            self.operations = counter.get_total_flops()
-        else:
-            loss = self._backward(batch)
+        loss = self._backward(batch)
         weights = [weight for weight in self.system.parameters() if weight.grad is not None]
         norm = nn.utils.clip_grad_norm_(weights, self.clip or float("inf"))
         values = torch.stack([loss.float(), norm.float()]).tolist()
@@ -179,6 +173,7 @@ class Training:
             raise NonFiniteError(f"Loss {values[0]}, gradient {values[1]} in {place}.\nGo on from the last state.")
         self.optimizer.step()
         progress.step += 1
+        self.num_taken += 1
         progress.seconds += time.perf_counter() - start
         point = {"loss": values[0], "gradient_norm": values[1], "lr": self._rates[0] * factor}
         where = {"phase": progress.phase, "step": progress.step, "seconds": round(progress.seconds, 2)}

@@ -99,7 +99,7 @@ def test_training_stops_goes_on_and_comes_home(pack: Path, tmp_path: Path, capsy
     assert done.phase == 2
     curve = json.loads((state / "curve.json").read_text())
     assert {point["phase"] for point in curve} == {0, 1}
-    assert "TFLOP an update" in capsys.readouterr().out
+    assert "s each)" in capsys.readouterr().out
 
     run = tmp_path / "run"
     assert rented_gpu.main(["run", "--pack", str(pack), "--state", str(state), "--folder", str(run)]) == 0
