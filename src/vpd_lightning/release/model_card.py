@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.metrics.registry import HEADLINE, referenced, scores
 from vpd_lightning.release.card_figures import beaten_by, beaten_in_motion_by, figure_lines, short_title
 from vpd_lightning.release.system_notes import describe_system, reads_depth, renders_any_camera
@@ -33,7 +34,7 @@ def model_card(content: CardContent) -> str:
         _introduction(content),
         *_section("Figures", figure_lines(content.metrics)),
         *_section("Load it", _usage_lines(content)),
-        *_section("Data", _data_lines(content.config, content.metrics)),
+        *_section("Data", _data_lines(content.config, content.metrics, content.index.get(TRAINED_ON))),
         *_section("Training", _training_lines(content)),
         *_section("Intended use", [_INTENDED_USE]),
         *_section("Limits", _limit_lines(content)),
@@ -100,17 +101,21 @@ def _input_line(system: str, views: list[int]) -> str:
     return f"Input: two {frames} of the calibrated cameras {views} of the data set."
 
 
-def _data_lines(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> list[str]:
+def _data_lines(config: Mapping[str, Any], metrics: Mapping[str, Any], trained_on: Sequence[str] | None) -> list[str]:
     folder, wanted = config["data"]["folder"], config.get("generate")
     digest = metrics.get("data_sha256")
     lines = []
+    # The folder may hold another number than the preset says; how many there were is known where all were trained on.
+    is_known = trained_on is not None and config["data"].get("num_trajectories") is None
+    size = f" splits.train={len(trained_on or ())}" if is_known else ""
     if wanted and wanted.get("scene"):
         lines += [
             f"Synthetic videos of the scene `{wanted['scene']}`, preset `{wanted['preset']}`, simulated with MuJoCo. "
             "Making them again gives the same physics; pictures agree bit for bit on one machine only:",
             "",
             "```",
-            f"vpd-data generate scene={wanted['scene']} preset={wanted['preset']} out={folder} seed={wanted['seed']}",
+            f"vpd-data generate scene={wanted['scene']} preset={wanted['preset']} out={folder} seed={wanted['seed']}"
+            + size,
             "```",
         ]
     else:
