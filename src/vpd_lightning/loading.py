@@ -83,7 +83,7 @@ def load_model(
     from vpd_lightning.config.sleeping import with_sleeping
 
     target = find_device(device)
-    stored = _read(Path(path).expanduser())
+    stored = read_stored(Path(path).expanduser())
     path = stored.path
     if not isinstance(stored.config, dict) or not isinstance(stored.config.get("scene"), dict):
         raise CheckpointError(f"{path} does not say what model it holds (no hyper_parameters).\nUse one of vpd-train.")
@@ -124,7 +124,7 @@ def load_model(
 
 
 @dataclass(frozen=True)
-class _Stored:
+class StoredModel:
     """What a file on disk says: weights by their names in the system, and a configuration that nobody checked yet."""
 
     path: Path
@@ -136,21 +136,26 @@ class _Stored:
     checkpoint: Mapping[str, Any] | None
 
 
-def _read(path: Path) -> _Stored:
+def read_stored(path: Path) -> StoredModel:
+    """Read a checkpoint, the newest good one of a run folder, or a released folder (or the weights in one).
+
+    Raises:
+        CheckpointError: there is none, or it is damaged.
+    """
     from vpd_lightning.data.trained_on import TRAINED_ON
     from vpd_lightning.training.checkpoint_files import open_checkpoint
     from vpd_lightning.training.checkpoints import open_resume
 
     if is_release(path):
         released = read_release(path)
-        return _Stored(
+        return StoredModel(
             released.path, released.weights, released.config, released.step,
             sha256=released.sha256, trained_on=_checksums(released.trained_on), checkpoint=None,
         )  # fmt: skip
     opened = open_resume(path) if path.is_dir() else open_checkpoint(path)
     content = opened.content
     step = content.get("global_step", 0)
-    return _Stored(
+    return StoredModel(
         path=opened.path,
         weights=simulator_weights(content),
         config=content.get("hyper_parameters"),

@@ -112,6 +112,29 @@ def test_staged_vpd_learns_its_dynamics_by_pixels_through_what_the_first_trainin
 
 
 @pytest.mark.slow
+def test_training_goes_on_from_released_weights(data: Path, tmp_path: Path) -> None:
+    released = Path(__file__).parents[2] / "released" / "mujoco_block_vpd"
+    words = ["experiment=mujoco_block", "model=vpd_staged", "budget=hour", "evaluate=false", "trainer.max_steps=1"]
+    small = ["data.batch_size=1", "data.num_steps=1", "data.num_steps_schedule=null", "data.rays_per_step=64"]
+    places = [f"data.folder={data}", f"run.folder={tmp_path / 'run'}", f"pretraining.ckpt={released}"]
+
+    assert main([*words, *small, *places, "num_threads=1", "logger=none", "data.num_validation_clips=0"]) == 0
+
+    stored = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    found, before = stored["state_dict"], load(released).state_dict()
+    frozen = [name for name in before if not name.startswith("dynamics.")]
+    assert all(torch.equal(found[f"simulator.{name}"], before[name]) for name in frozen)
+    assert not torch.equal(
+        *(
+            weights["dynamics.decode_location.layers.3.weight"]
+            for weights in (before, {name.removeprefix("simulator."): value for name, value in found.items()})
+        )
+    )
+    index = json.loads((released / "release.json").read_text())
+    assert set(index[TRAINED_ON]) < set(stored[TRAINED_ON])
+
+
+@pytest.mark.slow
 def test_run_that_ended_between_the_two_trainings_goes_on(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert train(data, run) == 0

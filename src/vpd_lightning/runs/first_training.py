@@ -13,18 +13,17 @@ from lightning.pytorch.utilities import rank_zero_only
 from vpd_lightning.config import pretraining_config
 from vpd_lightning.config.migrations import upgraded
 from vpd_lightning.config.pretraining import FOLDER
-from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.data.views.slot_store import INDEX_FILE
 from vpd_lightning.data.views.view_datamodule import FOLDER as SLOTS
 from vpd_lightning.errors import CheckpointError, ConfigError
 from vpd_lightning.files import AtomicPath
-from vpd_lightning.loading import simulator_weights
+from vpd_lightning.loading import read_stored
+from vpd_lightning.release.release_folder import is_release, read_release
 from vpd_lightning.release.results_folder import run_folder
 from vpd_lightning.runs.resume import has_own_checkpoint
 from vpd_lightning.system import AbstractSystem
 from vpd_lightning.training.callbacks.time_budget import FILE as TIME_FILE
 from vpd_lightning.training.callbacks.time_budget import TimeBudget
-from vpd_lightning.training.checkpoint_files import load_checkpoint
 from vpd_lightning.training.checkpoints import find_resume
 
 DONE_FILE = "done.json"
@@ -41,7 +40,10 @@ Fit = Callable[..., None]
 
 @dataclass(frozen=True)
 class FirstTraining:
-    """What the first training left: its checkpoint, and the seconds it used (0 where unknown and without a limit)."""
+    """What the first training left: its checkpoint or released weights, and the seconds that it used.
+
+    0 seconds: unknown and without a limit, or released weights, whose training the card describes.
+    """
 
     checkpoint: Path
     seconds: float
@@ -53,13 +55,15 @@ def train_first(
     """Do what ``pretraining`` asks for, as far as it is not done yet; None where it asks for nothing.
 
     Raises:
-        CheckpointError: ``pretraining.ckpt`` names no good checkpoint.
+        CheckpointError: ``pretraining.ckpt`` names no good checkpoint and no released model.
         ConfigError: there is a time budget, and what the first training used is unknown, or all of it.
     """
     first_config = pretraining_config(config)
     if first_config is None:
         return None
     given = config["pretraining"]["ckpt"]
+    if given and is_release(Path(given).expanduser()):
+        return FirstTraining(_released(Path(given).expanduser()), 0.0)
     if given:
         checkpoint = find_resume(Path(given).expanduser())
         seconds = _seconds_used(run_folder(checkpoint), config)
@@ -77,6 +81,13 @@ def train_first(
             (inner / DONE_FILE).write_text(json.dumps({"done": True}) + "\n", encoding="utf-8")
             print("second training:", flush=True)
     return FirstTraining(find_resume(inner), _seconds_used(inner, config))
+
+
+def _released(folder: Path) -> Path:
+    """Return the file of released weights. What made them is no part of this run's time."""
+    path = read_release(folder).path
+    log.info("the training behind %s is not counted in the time of this one; its card says what it took", path.parent)
+    return path
 
 
 def hand_over(
@@ -141,15 +152,15 @@ def load_pretrained(system: AbstractSystem, checkpoint: Path, config: Mapping[st
 
     Args:
         system: of the second training.
-        checkpoint: of the first training.
+        checkpoint: of the first training, or released weights.
         config: what ``system`` was built from.
 
     Raises:
         CheckpointError: a weight has no place, or another shape; what holds the weights has other settings; a weight
             that the second training leaves as it is does not come from the first.
     """
-    content = load_checkpoint(checkpoint)
-    weights = simulator_weights(content)
+    stored = read_stored(checkpoint)
+    weights = stored.weights
     own = system.state_dict()
     homeless = sorted(name for name in weights if name not in own)
     if homeless:
@@ -162,7 +173,7 @@ def load_pretrained(system: AbstractSystem, checkpoint: Path, config: Mapping[st
     except RuntimeError as error:
         detail = " ".join(str(error).split())
         raise CheckpointError(f"{checkpoint} does not fit the second training's model.\n{detail[:300]}") from error
-    _require_same_settings(checkpoint, weights, content.get("hyper_parameters") or {}, config)
+    _require_same_settings(checkpoint, weights, stored.config or {}, config)
     for name, parameter in system.named_parameters():
         if not parameter.requires_grad and name not in weights:
             raise CheckpointError(
@@ -170,7 +181,7 @@ def load_pretrained(system: AbstractSystem, checkpoint: Path, config: Mapping[st
                 "Name a checkpoint of the first training that belongs to this model: pretraining.ckpt=RUN"
             )
     log.info("took %d of %d weights from %s", len(weights), len(own), checkpoint)
-    return content.get(TRAINED_ON)
+    return None if stored.trained_on is None else sorted(stored.trained_on)
 
 
 def _require_same_settings(
