@@ -1,5 +1,6 @@
 """Encode, roll out, render: the parts put together, on a hand-made scene."""
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -118,6 +119,30 @@ def test_noise_is_for_training_only():
 
     assert (noisy - quiet).abs().max() > 0.05
     assert torch.equal(quiet, model(batch()).states[0].positions)
+
+
+class Noted(AbstractDynamics):
+    """Stands still; keeps the pairs of frames that it is given."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def forward(self, previous, current, memory, keys, rollout_step):
+        self.seen.append((previous.positions, current.positions))
+        return current, memory
+
+
+def test_what_a_step_saw_as_current_with_its_noise_the_next_one_sees_as_previous():
+    model = simulator(Noted(), location_noise=0.1)
+    model(batch())
+    seen = model.dynamics.seen
+
+    assert len(seen) == NUM_STEPS
+    for (_, current), (later_previous, later_current) in itertools.pairwise(seen):
+        # What stands still seems to move by the noise of one step; that of two would be 0.14.
+        assert 0.08 < float((later_current - later_previous).std()) < 0.12
+        assert torch.equal(later_previous, current)
 
 
 def test_the_python_face_encodes_rolls_out_and_renders():

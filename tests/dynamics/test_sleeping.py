@@ -1,3 +1,4 @@
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -87,9 +88,9 @@ def body(particles, number):
     return (particles.features[..., BODY] == number) & particles.mask
 
 
-def roll(dynamics, start, num_steps, memory=None):
+def roll(dynamics, start, num_steps, memory=None, keys=None):
     """Return the states, the first one ``start``, and the memory before each of them and after the last."""
-    keys = RandomKeys.fixed(len(start.positions))
+    keys = keys or RandomKeys.fixed(len(start.positions))
     memory = memory or dynamics.initialize(start, start, keys)
     states, memories = [start], [memory]
     previous = start
@@ -168,6 +169,22 @@ def test_a_thrown_body_wakes_a_sleeping_one_before_it_arrives():
     near = states[contact].positions[resting][:, 0] <= states[contact].positions[thrown][:, 0].max() + 0.25
     assert not memories[contact].asleep[resting][near].any()
     assert memories[contact].asleep.any(), "what is far from both sleeps on"
+
+
+def test_a_sleeper_keeps_its_count_of_steps_at_rest_and_starts_anew_when_it_wakes():
+    start = scene((block(0.0), (0, 0, 0)), (block(0.0, at=(-0.9, 0.0)), (0.05, 0.0, 0.0)))
+    _, memories = roll(sleeping(Scripted(gravity=0.0)), start, 16)
+    still = ~body(start, 2)  # never moves, so that each step awake is a step at rest
+    expected, times_fallen = torch.zeros_like(memories[0].num_rested), torch.zeros_like(memories[0].num_rested)
+
+    for before, after in itertools.pairwise(memories):
+        woken = still & before.asleep & ~after.asleep
+        expected = torch.where(before.asleep, expected, expected + 1).masked_fill(woken, 0)
+        torch.testing.assert_close(after.num_rested[still], expected[still], rtol=0, atol=0)
+        fallen = still & after.asleep & ~before.asleep
+        assert (after.num_rested[fallen] >= SETTINGS["rest_steps"]).all()
+        times_fallen += fallen
+    assert times_fallen.max() == 2, "some woke in between"
 
 
 def test_a_steady_slide_slower_than_rest_speed_stays_awake_and_jitter_does_not():
@@ -252,3 +269,26 @@ def test_members_of_a_batch_sleep_independently():
             assert torch.equal(a.asleep[member], b.asleep[0])
         valid = start.mask[0]
         assert torch.equal(states[-1].positions[member][valid], own[-1].positions[0][valid])
+
+
+class Shaken(AbstractDynamics):
+    """Body 1 climbs by what is drawn for its member, always by more than a sleeper may; all else stands still."""
+
+    def forward(self, previous, current, memory, keys, rollout_step):
+        draws = [torch.rand(3, generator=g, dtype=torch.float64) for g in keys.generators(f"shake/{rollout_step}")]
+        shaken = (current.features[..., BODY] == 1)[..., None]
+        steps = torch.where(shaken, 0.02 + 0.02 * torch.stack(draws)[:, None], 0.0)
+        return replace(current, positions=current.positions + steps), memory
+
+
+def test_members_of_a_partly_sleeping_batch_draw_with_their_own_keys():
+    alone = scene((block(0.6), (0, 0, 0)))
+    together = Particles(alone.positions.expand(2, -1, -1), alone.features.expand(2, -1, -1))
+    states, memories = roll(sleeping(Shaken()), together, 8, keys=RandomKeys(1, 2, [5, 9]))
+
+    assert memories[4].asleep.any(dim=1).all() and not memories[-1].asleep.all(dim=1).any()
+    assert not torch.equal(states[-1].positions[0], states[-1].positions[1]), "the draws differ"
+    for member, index in enumerate((5, 9)):
+        own, _ = roll(sleeping(Shaken()), alone, 8, keys=RandomKeys(1, 2, [index]))
+        for state, expected in zip(states, own, strict=True):
+            torch.testing.assert_close(state.positions[member], expected.positions[0], rtol=0, atol=0)

@@ -115,6 +115,16 @@ def test_history_moves_along_so_that_velocities_turn_with_the_body():
         assert torch.equal(edited.previous.positions[0][before == body], scene.previous.positions[0][before == body])
 
 
+def test_normals_turn_with_the_body_in_both_frames_and_no_others_do():
+    scene, before, now = two_boxes()
+    moved = vpd.SceneEditor(scene).move(now == RED, [1.0, 0.0, 0.0], about_axis([0, 0, 1], 90)).scene
+    for frame, body in (("previous", before), ("current", now)):
+        was, turned = getattr(scene, frame).normals[0], getattr(moved, frame).normals[0]
+        x, y, z = was[body == RED].unbind(dim=1)  # a quarter turn about z takes x to y, and y to -x
+        torch.testing.assert_close(turned[body == RED], torch.stack([-y, x, z], dim=1), rtol=0, atol=1e-6)
+        assert torch.equal(turned[body != RED], was[body != RED])
+
+
 @pytest.mark.parametrize("full", [True, False])
 def test_a_deleted_body_is_gone_from_both_frames_and_no_other_is(full):
     scene, before, now = two_boxes(full=full)

@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -118,6 +120,36 @@ def test_randomness_comes_from_the_keys_alone() -> None:
     assert not torch.equal(first, renderer(particles, rays, RandomKeys(1, 3, [3, 4])).rgbs)
     with pytest.raises(ValueError, match="one sample per member"):
         renderer(particles, rays, RandomKeys.fixed(3))
+
+
+def test_the_two_tiers_draw_independently() -> None:
+    num_rays, num_samples = 300, 8
+    renderer = renderer_of(
+        feature_dim=1, num_neighbors=1, kernel_radii=(0.0,), kernel_bandwidths=(2.0,), density_activation="relu",
+        num_coarse_samples=num_samples, num_fine_samples=num_samples,
+    )  # fmt: skip
+    for field in (renderer.coarse, renderer.fine):  # nothing stops light: fine samples are spread over the whole ray
+        torch.nn.init.zeros_(field.density.weight)
+        torch.nn.init.constant_(field.density.bias, -1.0)
+    # One particle where the rays begin, whose feature tells how far away it is.
+    camera = torch.zeros(1, 1, 3, dtype=torch.float64)
+    directions = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(1, num_rays, 3)
+    seen = {}
+
+    def note(name: str) -> Callable[..., None]:
+        return lambda module, inputs: seen.__setitem__(name, 2.0 * (-inputs[0].log()).sqrt().view(num_rays, -1))
+
+    renderer.coarse.register_forward_pre_hook(note("coarse"))
+    renderer.fine.register_forward_pre_hook(note("both"))
+    particles = Particles(camera, torch.ones(1, 1, 1, dtype=torch.float64))
+    renderer(particles, Rays(camera.expand_as(directions), directions), RandomKeys(0, 3, [0]))
+
+    coarse = seen["coarse"].sum(dim=1)
+    fine = seen["both"].sum(dim=1) - coarse
+    assert seen["both"].shape == (num_rays, 2 * num_samples) and float(fine.std() / num_samples) > 0.2
+    # Fine samples lie between coarse ones, which are a seventh of the ray apart, and so move by a seventh as much with
+    # those as by their own draws. From the same numbers it would be nearly 1.
+    assert abs(float(torch.corrcoef(torch.stack([coarse, fine]))[0, 1])) < 0.4
 
 
 def test_a_particle_that_is_not_a_number_is_refused() -> None:
