@@ -202,12 +202,15 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         generators = keys.generators(f"abstract/{rollout_step}")
         if self.edge_capacity is not None and current.num_particles:
             return self._static_advance(previous, current, generators, num_abstract_nodes)
-        previous, current = previous.without_padding(), current.without_padding()
+        previous, whole = previous.without_padding(), current.without_padding()
         require_finite(
             "Dynamics",
-            positions=torch.cat([previous.positions, current.positions], dim=1),
-            features=torch.cat([previous.features, current.features], dim=1),
+            positions=torch.cat([previous.positions, whole.positions], dim=1),
+            features=torch.cat([previous.features, whole.features], dim=1),
         )
+        # Rows that are padding in all members would cost as much as particles: encoders leave a third where the
+        # workspace holds fewer pixels than num_particles.
+        previous, current = _rows_in_use(previous), _rows_in_use(whole)
         graph = build_graph(
             previous,
             current,
@@ -221,7 +224,10 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         )
         self.last_uncovered_share = _uncovered_share(current, graph)
         positions, features = self._following(previous, current, graph)
-        return replace(current, positions=positions, features=features)
+        if rest := whole.num_particles - current.num_particles:
+            positions = torch.cat([positions, whole.positions[:, -rest:]], dim=1)
+            features = torch.cat([features, whole.features[:, -rest:]], dim=1)
+        return replace(whole, positions=positions, features=features)
 
     def _static_advance(
         self, previous: Particles, current: Particles, generators: list[torch.Generator], num_abstract_nodes: int
@@ -324,6 +330,15 @@ class HierarchicalGNNDynamics(AbstractDynamics):
 def _usable(particles: Particles, name: str) -> Float[Tensor, "node any"]:
     """Return one field, flat, with zeros for padding, whose numbers must not get anywhere, not even as NaN times 0."""
     return torch.where(particles.mask[..., None], getattr(particles, name), 0.0).flatten(0, 1)
+
+
+def _rows_in_use(particles: Particles) -> Particles:
+    """Return places, features and mask up to the last particle that is valid in any member (at least one row)."""
+    used = particles.mask.any(dim=0).nonzero()
+    count = int(used[-1]) + 1 if len(used) else 1
+    if count >= particles.num_particles:
+        return particles
+    return Particles(particles.positions[:, :count], particles.features[:, :count], particles.mask[:, :count])
 
 
 def _uncovered_share(current: Particles, graph: HierarchicalGraph) -> Float[Tensor, ""]:
