@@ -1,4 +1,4 @@
-"""The released graph network of VPD, rolled out sixteen times as far as it is judged: whatever it draws, it is finite."""
+"""The released graph network of VPD, rolled out 500 steps, where 32 are judged: whatever it draws, it is finite."""
 
 from pathlib import Path
 

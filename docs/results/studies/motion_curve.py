@@ -55,10 +55,14 @@ def measured(model: LoadedModel, data: Path, split: str, start_frames: Sequence[
                     predicted = (positions[1] - positions[0])[body.mask].mean(dim=0)
                     moved.append(np.stack([predicted.numpy(), (body.true[1] - body.true[0]).mean(dim=0).numpy()]))
     at = [step - 1 for step in STEPS]
-    means = {name: np.nanmean(np.concatenate(values)[:, at], axis=0) for name, values in errors.items()}
 
-    def row(name: str, scale: float) -> dict[str, float]:
-        return {str(step): float(scale * value) for step, value in zip(STEPS, means[name], strict=True)}
+    def row(name: str, scale: float) -> dict[str, float | None]:
+        values = np.concatenate(errors[name])[:, at]
+        known = [column[~np.isnan(column)] for column in values.T]  # soft bodies, for example, have no size
+        return {
+            str(step): float(scale * column.mean()) if len(column) else None
+            for step, column in zip(STEPS, known, strict=True)
+        }
 
     return {
         "centroid_error_cm": {
