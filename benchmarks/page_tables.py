@@ -147,12 +147,10 @@ def vpd_motion(content: Mapping[str, Any], path: Path) -> str:
         lines.append(
             f"| {name} | " + _line(f"{row['centroid_error']['model'][str(step)]['mean']:.1f}" for step in steps)
         )
-        cells = []
-        for step in steps:
-            found = row["difference"]["best_constant"][str(step)]
-            low, high = found["ci95"]
-            cells.append(f"{found['mean']:.1f} [{low:.1f}, {high:.1f}]")
-        lines.append(f"| {name}, less the best constant | " + _line(cells))
+        for reference, title in {"nothing_moves": "nothing moves", "best_constant": "the best constant"}.items():
+            found = [row["difference"][reference][str(step)] for step in steps]
+            cells = [f"{one['mean']:.1f} [{one['ci95'][0]:.1f}, {one['ci95'][1]:.1f}]" for one in found]
+            lines.append(f"| {name}, less {title} | " + _line(cells))
     first = next(iter(content.values()))["centroid_error"]
     for name in ("nothing_moves", "best_constant", "constant_velocity"):
         cells = [f"{first[name][str(step)]['mean']:.1f}" for step in steps]
@@ -162,7 +160,8 @@ def vpd_motion(content: Mapping[str, Any], path: Path) -> str:
     lines += ["", *_head(titles, 1)]
     for name, row in content.items():
         cells = [f"{row[key]['model']:.{2 + (key == 'ssim')}f}" for key in pictures]
-        cells += [f"{100 * row['chamfer']:.1f}", f"{row['size_ratio']['32']['mean']:.2f}", f"{row['updates']:,}"]
+        size = row["size_ratio"]["32"]["mean"]  # soft bodies have none
+        cells += [f"{100 * row['chamfer']:.1f}", "-" if size is None else f"{size:.2f}", f"{row['updates']:,}"]
         lines.append(f"| {name} | " + _line(cells))
     for name, title in {"copy_last": "*last frame*", "train_mean": "*mean image*"}.items():
         cells = [f"{row[key][name]:.{2 + (key == 'ssim')}f}" for key in pictures]

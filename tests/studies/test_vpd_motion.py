@@ -52,7 +52,10 @@ def test_a_difference_that_is_the_same_everywhere_has_an_interval_without_width(
     assert row["difference"]["constant_velocity"]["1"]["mean"] > 0
     table = page_tables.vpd_motion({"seed 0": row}, out)
     assert "| seed 0, less the best constant | -15.0 [-15.0, -15.0] |" in table
+    assert "| seed 0, less nothing moves | -5.0 [-5.0, -5.0] |" in table
     assert "| seed 0 | 0.50 | 0.50 | 0.500 | 2.0 | 1.00 | 7 |" in table
+    row["size_ratio"]["32"]["mean"] = None
+    assert "| seed 0 | 0.50 | 0.50 | 0.500 | 2.0 | - | 7 |" in page_tables.vpd_motion({"seed 0": row}, out)
 
 
 def test_what_is_no_evaluation_is_refused(tmp_path: Path) -> None:
