@@ -1,4 +1,4 @@
-"""Words of a command line that would change nothing: they are refused, lest a result be put down to them."""
+"""Command-line arguments without effect: they are refused, so that no result is attributed to them."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -125,7 +125,7 @@ def check_release(folder: Path) -> dict[str, Any]:
             f"{folder / PROGRAM_FILE} does not belong there: {INDEX_FILE} does not name it.\n{_AGAIN}"
         )
     if not (folder / CARD_FILE).is_file():
-        raise CheckpointError(f"{folder} is incomplete: {CARD_FILE} is missing.\n{_AGAIN}")
+        raise CheckpointError(f"{folder} is not whole: {CARD_FILE} is missing.\n{_AGAIN}")
     return index
 
 
@@ -168,7 +168,7 @@ def _read_bytes(path: Path, limit: int | None) -> bytes:
             raise CheckpointError(f"{path} has {path.stat().st_size} bytes, more than the allowed {limit}.")
         return path.read_bytes()
     except FileNotFoundError:
-        raise CheckpointError(f"{path.parent} is incomplete: {path.name} is missing.\n{_AGAIN}") from None
+        raise CheckpointError(f"{path.parent} is not whole: {path.name} is missing.\n{_AGAIN}") from None
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror or error}.") from error
 

@@ -75,7 +75,7 @@ class TimeBudget(pl.Callback):
         datamodule: Any = trainer.datamodule  # type: ignore[attr-defined]
         if datamodule.num_workers:
             raise ConfigError(
-                "data.num_steps_schedule follows the clock of callbacks.time_budget.minutes, which the"
+                "data.num_steps_schedule follows the time that callbacks.time_budget.minutes allows, which the"
                 f" {datamodule.num_workers} processes that read data cannot see.\n"
                 "Set data.num_workers=0, or data.num_steps_schedule=null."
             )
