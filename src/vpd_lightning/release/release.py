@@ -110,7 +110,7 @@ def _require_plain_test(metrics: Mapping[str, Any], path: Path, checkpoint: Path
         raise ConfigError(f"{path} was measured with {differs[0]}={metrics[differs[0]]}.\n{again}")
     split = metrics["protocol"].get("split")
     if split != "test":
-        raise ConfigError(f"{path} was measured on the {split} split; a card reports the test split.\n{again}")
+        raise ConfigError(f"{path} is about the {split} split; a card reports the test split.\n{again}")
     count = (metrics.get("seen_in_training") or {}).get("trajectories")
     if count:
         raise ConfigError(
