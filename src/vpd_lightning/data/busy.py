@@ -24,7 +24,7 @@ def busy_error(path: Path, error: BaseException) -> BrokenFileError | None:
         return None
     holders = writers or _programs(path, writing=False)
     who = f"held open by {', '.join(holders[:_MAX_NAMED])}" if holders else "held open by another program"
-    way_out = "The file is not damaged. Close it in that program, then try again."
+    way_out = "The file is intact. Close it in that program, then try again."
     if is_marked and not holders:
         who = "marked as open for writing, but no visible process has it open"
         way_out = f"Where a program was killed while it wrote, `h5clear -s {path}` removes the mark; validate it then."
