@@ -14,7 +14,7 @@ class ConfigError(VPDError):
 
 
 class EditError(ConfigError):
-    """An edit of a scene that means nothing, selects nothing, or cannot be read."""
+    """An edit of a scene that is invalid, selects nothing, or cannot be read."""
 
 
 class DataError(VPDError):

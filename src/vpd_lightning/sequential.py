@@ -39,8 +39,8 @@ class AutoEncoder(Simulator):
     """The first training: encoder and renderer on single frames, whose rays are those of the encoded frame.
 
     Frames, rays, subsampling and location noise are those of end-to-end training; nothing moves. ``dynamics`` has
-    nothing to learn here, so it must have no weights; with one that keeps everything in place the evaluation face is
-    that of a static scene.
+    nothing to learn here, so it must have no weights; with ``PersistenceDynamics`` an evaluation sees
+    a static scene.
     """
 
     # Paper: says "auto-encoder pre-training" only; frames, rays and noise as in the end-to-end model are our reading.
@@ -86,12 +86,12 @@ class SequentialSimulator(Simulator):
     """The second training: the dynamics alone, by the renderer's input features instead of by pixels.
 
     Predicted particles and those encoded from the true frames of the same step have no correspondences. So both are
-    looked at through what the renderer would see of them at the same ``num_points`` points, drawn anew for every
-    training step and predicted step, uniformly in the box from ``workspace_min`` to ``workspace_max`` (metres). Encoder
+    compared by the renderer's input features at the same ``num_points`` points, drawn anew for every training step
+    and predicted step, uniformly in the box from ``workspace_min`` to ``workspace_max`` (metres). Encoder
     and renderer are frozen: their weights come from an ``AutoEncoder``. In use it is a ``Simulator`` like any other.
 
-    # Paper: compares at the next time step; as many steps as the data say (``data.num_steps``, 1 for the next one
-    # alone) are compared here, with the mean over them.
+    # Paper: compares at the next time step; here ``data.num_steps`` steps are compared (1: the next one alone), and
+    # the loss is the mean over them.
     """
 
     def __init__(

@@ -37,11 +37,11 @@ class Scene:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A rollout that stands at one step, for programs that decide as they go. ``Simulator.start`` gives the first one.
+    """The state of a rollout at one step, for programs that step it themselves; ``Simulator.start`` returns the first.
 
-    ``particles`` are those after ``num_steps`` steps (batch axis of 1), ``previous`` those of the step before. Nothing
-    in it changes: ``step`` returns another rollout, so several plans may go on from the same one. The memory of the
-    dynamics goes along, which a pair of particle sets does not tell: the steps are those of ``Simulator.rollout``.
+    ``particles`` are those after ``num_steps`` steps (batch axis of 1), ``previous`` those of the step before. It is
+    immutable: ``step`` returns another rollout, so several plans may branch from the same one. It includes the memory
+    of the dynamics, which two particle sets do not determine, so its steps equal those of ``Simulator.rollout``.
     """
 
     simulator: "Simulator"
@@ -66,8 +66,8 @@ class Simulator(AbstractSystem):
     ``location_noise`` is the standard deviation (metres) of the noise on particle positions during training rollouts.
     ``checkpoint_dynamics`` recomputes each dynamics step in the backward pass: exact gradients, less memory.
     ``pixel_gradient_to_motion`` is the share of the gradient of rendered rays that reaches predicted positions
-    (features get all of it): 1 is the paper; with a loss on motion itself, 0 keeps an unfinished renderer from steering
-    bodies.
+    (features get all of it): 1 is the paper; with a loss on motion itself, 0 keeps a renderer that is not
+    trained yet from moving bodies.
     """
 
     num_context_frames = NUM_CONTEXT_FRAMES
@@ -181,7 +181,7 @@ class Simulator(AbstractSystem):
         states = self.rollout(scene, cameras.shape[0])
         return torch.cat([self.render([state], cameras[step]) for step, state in enumerate(states)])
 
-    # The Python face for people who have a trained model.
+    # The Python interface to a trained model.
 
     @torch.no_grad()
     def encode(self, rgb: Tensor, depth: Tensor, cameras: Cameras, keys: RandomKeys | None = None) -> Scene:

@@ -127,7 +127,7 @@ def require_finite(where: str, **inputs: Tensor) -> None:
     bad = [name for name, is_finite in zip(inputs, finite.tolist(), strict=True) if not is_finite]
     raise NonFiniteError(
         f"{where}: NaN or infinity in {' and '.join(bad)}.\n"
-        "A model that diverged, or damaged data; lower the learning rate or check the data with vpd-data validate."
+        "The model diverged or the data are damaged: lower the learning rate, or check with vpd-data validate."
     )
 
 

@@ -123,7 +123,7 @@ def _check(config: Mapping[str, Any]) -> None:
             raise ConfigError(f"num_views={config['num_views']} is out of range.\nAllowed: 1 or more, or null.")
         if config["freeze_step"] is None or config["camera"] != "ring":
             raise ConfigError(
-                "num_views counts the places of a ring around a moment that stands still.\n"
+                "num_views is the number of camera positions on a ring around one frozen step.\n"
                 "Set camera=ring and freeze_step=STEP, or leave num_views out."
             )
     for name, allowed in (("save_particles", PARTICLE_FORMATS), ("save_maps", MAPS)):

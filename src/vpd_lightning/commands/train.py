@@ -134,7 +134,7 @@ def _check_places(configs: Sequence[dict[str, Any]], overrides: Sequence[str], a
     elif _world_size() > 1 and not configs[0]["run"]["folder"]:
         raise ConfigError(
             "several processes were started, and each would choose a run folder of its own.\n"
-            "Give them one: run.folder=FOLDER. (vpd-train starts its own processes with trainer=ddp.)"
+            "Set one folder for all of them: run.folder=FOLDER. (vpd-train starts its own processes with trainer=ddp.)"
         )
 
 

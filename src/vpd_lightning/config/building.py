@@ -166,7 +166,7 @@ def refuse_references(node: Any, name: str) -> None:
     """
     if isinstance(node, str) and _REFERENCE in node:
         raise ConfigError(
-            f"{name} holds a reference, which would be followed behind the check of what may be built.\n"
+            f"{name} holds a reference (${{...}}), which would be resolved after the check of the allowed classes.\n"
             f"Given: {node[:80]!r}. Write the value itself."
         )
     if isinstance(node, Mapping):

@@ -208,7 +208,7 @@ def option_folders(config_dir: str | Path | None, overrides: Sequence[str] = ())
         if gone is not None:
             raise ConfigError(
                 f"{folder / gone} would have no effect: there is no group {gone} any more.\n"
-                "What a model is made of at a size, and how that is trained, stands in recipe/SIZE/MODEL.yaml."
+                "The stages of a model at one size, and how they are trained, are set in recipe/SIZE/MODEL.yaml."
             )
     return folders
 
@@ -225,8 +225,8 @@ def _refuse_stage_settings(overrides: Sequence[str], folders: Sequence[Path]) ->
             stage = next((name for name in STAGES if path.is_file() and name in OmegaConf.load(path)), None)
             if stage is not None:
                 raise ConfigError(
-                    f"{path} sets values of {stage}, which the recipe of the model at its size would overwrite.\n"
-                    f"Make them an option, {stage}/mine.yaml, and choose it there: override /{stage}: mine"
+                    f"{path} sets values of {stage}, which the model's recipe for this size would overwrite.\n"
+                    f"Move them to an option file {stage}/mine.yaml, and select it: override /{stage}: mine"
                 )
 
 

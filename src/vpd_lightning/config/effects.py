@@ -1,4 +1,4 @@
-"""Words of a command line that would change nothing: they are refused, lest a result be put down to them."""
+"""Command-line arguments without effect: they are refused, so that no result is attributed to them."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -103,7 +103,7 @@ def _reason(key: str, resolved: Mapping[str, Any]) -> str | None:
         other, is_fitting, wanted = _ONLY_WITH[key]
         value = _at(resolved, other)
         if not is_fitting(value):
-            return f"{other} is {'null' if value is None else value}; it counts where that is {wanted}"
+            return f"{other} is {'null' if value is None else value}; it has an effect only if that is {wanted}"
     section, _, name = key.partition(".")
     settings = resolved.get(section)
     if not name or not isinstance(settings, Mapping) or not isinstance(settings.get("_target_"), str):

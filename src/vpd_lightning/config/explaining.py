@@ -125,7 +125,7 @@ def _explain_unknown_key(
     try:
         others = [word for word in overrides if "." not in word.partition("=")[0] and not word.startswith(key)]
         if len(others) == len(overrides):  # an option's own fault: fewer words would end here again
-            return ConfigError(f"{str(cause).splitlines()[0]}\nThe options chosen do not fit together; remove one.")
+            return ConfigError(f"{str(cause).splitlines()[0]}\nThe chosen options are incompatible; remove one.")
         known = list(keys_of(compose(others)))
         if key in known:  # a group that no line of this configuration names
             return ConfigError(
@@ -153,7 +153,7 @@ def _explain_unfit_word(overrides: Sequence[str], compose: Callable[[Sequence[st
             return ConfigError(f"there is no key {key} here: {section} is null.\nChoose an option that fills it.")
         if OmegaConf.is_dict(OmegaConf.select(config, key)) and not isinstance(value, str | dict):
             return ConfigError(f"{key} is a section.\nSet one of its keys, {key}.KEY=VALUE, or {key}={{KEY: VALUE}}.")
-    return ConfigError("the words do not fit the configuration.\nAll keys and their values: --cfg job.")
+    return ConfigError("the arguments do not fit the configuration.\nAll keys and their values: --cfg job.")
 
 
 def _nearest_key(key: str, known: Sequence[str]) -> str:

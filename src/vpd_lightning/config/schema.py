@@ -1,4 +1,4 @@
-"""The types of the configuration's roots, and the ranges that no constructor sees.
+"""The types of the configuration's roots, and the ranges that no constructor checks.
 
 Every value lives in ``conf/``: fields have no defaults here. A stage's own section is a plain mapping, checked against
 the signature of the class it names (see ``building.py``).

@@ -24,9 +24,9 @@ def busy_error(path: Path, error: BaseException) -> BrokenFileError | None:
         return None
     holders = writers or _programs(path, writing=False)
     who = f"held open by {', '.join(holders[:_MAX_NAMED])}" if holders else "held open by another program"
-    way_out = "Nothing is wrong with it. Let that program close it, then try again."
+    way_out = "The file is intact. Close it in that program, then try again."
     if is_marked and not holders:
-        who = "marked as open for writing; no program that can be seen here holds it"
+        who = "marked as open for writing, but no visible process has it open"
         way_out = f"Where a program was killed while it wrote, `h5clear -s {path}` removes the mark; validate it then."
     return refuse(path, KIND, f"is busy ({who})", way_out)
 

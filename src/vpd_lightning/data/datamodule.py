@@ -178,7 +178,7 @@ class VideoDataModule(pl.LightningDataModule):
             )
         if trainer.world_size > 1 and trainer._accelerator_connector.use_distributed_sampler:
             raise ConfigError(
-                "Clips are shared out to devices by this program; Lightning would do it once more.\n"
+                "This program divides the clips among the devices; Lightning would divide them a second time.\n"
                 "Set trainer.use_distributed_sampler=false."
             )
         return self.loader(trainer.max_steps, lambda: trainer.global_step, trainer.global_rank, trainer.world_size)
@@ -212,7 +212,8 @@ class VideoDataModule(pl.LightningDataModule):
         rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         if len(self.validation) % world_size:
             raise ConfigError(
-                f"data.num_validation_clips={len(self.validation)} must divide by the number of devices, {world_size}."
+                f"data.num_validation_clips={len(self.validation)} must be a multiple of the number of devices,"
+                f" {world_size}."
             )
         share = Subset(self.validation, range(rank, len(self.validation), world_size))
         return DataLoader(share, batch_size=None, collate_fn=_unchanged, num_workers=0)

@@ -224,7 +224,7 @@ def _check_places(folder: Path, names: Mapping[str, str]) -> None:
 
 def _missing(folder: Path) -> str:
     if (folder / UNFINISHED_NAME).is_file():
-        return f"{folder} is not finished (there is no {FILE_NAME}).\nRun the command that began it again: it goes on."
+        return f"{folder} is not finished (there is no {FILE_NAME}).\nRepeat the command that started it: it resumes."
     scene, _, preset = folder.name.rpartition("_")
     if scene and preset in ("paper", "demo", "tiny"):
         command, hint = f"scene={scene} preset={preset}", ""

@@ -37,7 +37,7 @@ class StepBatchSampler(Sampler[list[int]]):
 
 
 class StepLoader(DataLoader[Any]):
-    """A loader that needs no state to resume: its sampler asks the trainer where to go on. This tells Lightning so."""
+    """A loader without state: its sampler asks the trainer where to resume. The methods make Lightning accept that."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return nothing."""

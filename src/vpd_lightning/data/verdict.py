@@ -31,11 +31,11 @@ def keep_verdict(manifest: Manifest, faults: Sequence[Fault]) -> str:
     """Keep what a validation of the whole data set found; returns why it could not be kept, or nothing."""
     errors = [fault for fault in faults if fault.is_error]
     if any(fault.name in _PASSING for fault in errors):
-        return "some files could not be read just now, so this is no verdict on them: validate again"
+        return "some files could not be read just now, so no verdict was stored: validate again"
     verdict = Verdict(manifest.files_digest, len(errors), str(errors[0]) if errors else "")
     text = json.dumps({"format_version": _FORMAT_VERSION, **asdict(verdict)}, indent=1) + "\n"
     if keep_file(manifest, FILE_NAME, lambda path: path.write_text(text, encoding="utf-8")) is None:
-        return f"the verdict could not be written to {manifest.folder}: a training will not know of it"
+        return f"the verdict could not be written to {manifest.folder}: vpd-train will not find it"
     return ""
 
 
@@ -65,11 +65,11 @@ def require_trusted(manifest: Manifest) -> None:
         raise DataError(
             f"{folder} failed vpd-data validate with {verdict.num_faults} fault{'s' * (verdict.num_faults > 1)}.\n"
             f"First: {verdict.first_fault}\n"
-            f"Mend that and validate it again: vpd-data validate {folder}\n{anyway}"
+            f"Fix that and validate again: vpd-data validate {folder}\n{anyway}"
         )
     if verdict is None and not manifest.generator.startswith(GENERATED):
         raise DataError(
-            f"{folder} holds recordings that were never validated; wrong conventions spoil a training without a word.\n"
+            f"{folder} holds recordings that were never validated; wrong conventions spoil a training silently.\n"
             f"Check them: vpd-data validate {folder}\n{anyway}"
         )
     twins = manifest.repeated()

@@ -58,7 +58,7 @@ class EdgeUpdater(nn.Module):
 
     The first layer is one weight over the concatenation, but it is applied in parts, ``W_e edge + (W_s senders)[edge's
     sender] + (W_r receivers)[edge's receiver] + b``: the same sum, with the node parts multiplied once per node and no
-    concatenation written down. ``num_node_inputs`` is 1 where receivers have no features yet.
+    concatenation in memory. ``num_node_inputs`` is 1 where receivers have no features yet.
 
     Without gradients on a CPU the edges are updated in place, some thousand at a time: every pass over them but the
     first then happens in the cache.

@@ -49,7 +49,7 @@ def _raise(dropped: int, non_finite: int, edge_capacity: int) -> None:
     if non_finite:
         raise NonFiniteError(
             f"Dynamics: {non_finite} particles of an earlier step are NaN or infinite.\n"
-            "Particles left the range of numbers: a model that diverged, or damaged depth or poses.\n"
+            "Either the model diverged, or depth or camera poses are damaged.\n"
             "Lower the learning rate, clip gradients, or check the data with vpd-data validate."
         )
     raise ConfigError(

@@ -17,7 +17,7 @@ class GlobalMLPDynamics(AbstractDynamics):
     """``s_{t+1} = normalize(s_t + MLP([s_{t-1}; s_t]))``; positions stay, and nothing depends on them.
 
     The MLP has ``num_hidden_layers`` layers of ``hidden_dim`` with ReLU behind each and a linear one to the width of
-    the scene vector. It starts with "nothing changes". Meant for the one particle of ``GlobalSceneEncoder``; of
+    the scene vector. Initially it predicts no change. Meant for the one particle of ``GlobalSceneEncoder``; of
     several particles the mean counts, and every one of them gets the same change.
     """
 

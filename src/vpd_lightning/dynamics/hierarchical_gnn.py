@@ -62,14 +62,14 @@ class HierarchicalGNNDynamics(AbstractDynamics):
     ``zero_init_decoders`` starts the last layers of both decoders at zero, so that before training nothing moves and no
     feature changes. ``normalized_edges`` divides relative positions by the radius within which edges are drawn (``r_s``
     or ``r_a_s``): the same functions, from inputs of order one whatever the scene's unit of length. ``edge_gain``
-    multiplies those between particles and abstract nodes: a velocity is told by a shift of a fraction of ``r_s``.
+    multiplies those between particles and abstract nodes: velocity shows as a shift by a fraction of ``r_s``.
 
     ``aggregation`` says how edges are brought together at a node: their ``sum``, or their ``mean``, whose size does not
     depend on how many particles lie around a node.
 
     Without ``update_features`` there is no feature decoder, and particles keep the features that they were encoded
-    with: what is seen can only move. With it, a network that does not know the motion yet lowers the error of the
-    pictures by fading bodies, and does not learn how they move.
+    with: only their positions change. With it, a network that has not learned the motion yet lowers the image error by
+    fading bodies out, and then does not learn how they move.
 
     # Paper: features are updated.
     # Paper: neither zero_init_decoders nor normalized_edges; relative positions of a few centimetres are a hundredth of

@@ -31,7 +31,7 @@ class HasAbstractNodes(Protocol):
 
 @dataclass(frozen=True)
 class SleepingMemory:
-    """Who sleeps, and for how many steps and from which place on (metres) each particle has been at rest."""
+    """Which particles sleep, for how many steps each has been at rest, and where its rest began (metres)."""
 
     inner: Any  # the memory of the wrapped dynamics
     asleep: Bool[Tensor, "batch particle"]
@@ -40,14 +40,14 @@ class SleepingMemory:
 
 
 class SleepingDynamics(AbstractDynamics):
-    """Wraps any dynamics and leaves out of its steps what is at rest.
+    """Wraps any dynamics and does not update particles at rest.
 
     All particles start awake; an edit rebuilds the memory, and everything is awake again. A particle falls asleep when
 
     - it rested for ``rest_steps`` steps: each no longer than ``rest_speed`` and all together no longer than
       ``rest_drift`` (both in units of ``location_scale`` metres), so that what slides slowly but steadily, faster than
       ``rest_drift / rest_steps`` a step, stays awake;
-    - it is supported: it hangs together, by links no longer than ``link_radius``, with an island at least
+    - it is supported: it belongs to an island, linked by distances up to ``link_radius``, that is at least
       ``ground_width`` wide. A body in flight (at its apex, or with its floor deleted) is an island by itself;
     - nothing that moves faster than ``rest_speed`` is within ``wake_radius`` of it, now or one such step ahead.
 

@@ -59,7 +59,7 @@ def about_axis(axis: Sequence[float], degrees: float) -> Quaternion:
     length = math.sqrt(x * x + y * y + z * z)
     if length < 1e-9 or not math.isfinite(degrees):
         raise EditError(
-            f"A rotation by {degrees} degrees about {tuple(axis)} means nothing.\nGive an axis and an angle."
+            f"A rotation by {degrees} degrees about {tuple(axis)} is undefined.\nGive a nonzero axis and finite angle."
         )
     half = math.radians(degrees) / 2
     share = math.sin(half) / length

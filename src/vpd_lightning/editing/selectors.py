@@ -156,7 +156,7 @@ class Cluster(Selector):
 
     def __post_init__(self) -> None:
         if (self.index is None) == (self.nearest is None):
-            raise EditError("A cluster is said by its index or by nearest=[x, y, z].\nGive one of both.")
+            raise EditError("A cluster is chosen by its index or by nearest=[x, y, z].\nGive one of both.")
         if self.index is not None and (type(self.index) is not int or self.index < 0):
             raise EditError(f"cluster.index is {self.index!r}.\nAllowed: a whole number from 0 up.")
         if self.nearest is not None:

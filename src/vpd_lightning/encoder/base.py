@@ -19,7 +19,7 @@ class EncoderOutput:
 
 
 class AbstractBackground(nn.Module, ABC):
-    """Tells what stands still in the frames of one time step from what may move.
+    """Separates pixels of static surfaces from those that may move, in the frames of one time step.
 
     Where ``needs_fit``, training calls ``fit(rgb, depth, cameras)`` with the median images of fixed cameras first.
     """

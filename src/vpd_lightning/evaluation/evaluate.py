@@ -151,7 +151,7 @@ def evaluate(
 
 
 def _shown_views(input_views: list[int], num_views: int) -> list[int]:
-    """Two cameras: the first that particles are seen through, and the first that they are not (or else the second)."""
+    """Two cameras: the first input camera, and the first that is no input (or, if all are, the second)."""
     known = [view for view in input_views if view < num_views]
     others = [view for view in range(num_views) if view not in known]
     return [*known[:1], *(others or known[1:])[:1]]

@@ -1,4 +1,4 @@
-"""Does a simulator stay sane far beyond what it was trained on: a long rollout of one clip, judged by its particles."""
+"""Does a simulator stay stable far beyond the training length: a long rollout of one clip, judged by its particles."""
 
 from dataclasses import dataclass
 

@@ -22,7 +22,7 @@ from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras, Particles
 
 @runtime_checkable
 class PredictsVideo(StructuralType):
-    """A system of particles: anything with the simulator's Python face."""
+    """A system of particles: anything with the simulator's Python interface."""
 
     def encode(self, rgb: Tensor, depth: Tensor, cameras: Cameras) -> Scene: ...
     def rollout(self, scene: Scene, num_steps: int) -> list[Particles]: ...

@@ -25,11 +25,11 @@ def seen_in_training(
     seen = [path for path, checksum in zip(paths, manifest.checksums(paths), strict=True) if checksum in trained_on]
     if seen and protocol.split != "train" and not force:
         backup, index = manifest.folder / BACKUP_NAME, manifest.folder / FILE_NAME
-        first_one = f"Go back to its first division, cp {backup} {index}\n" if backup.is_file() else ""
+        first_one = f"Restore the first split: cp {backup} {index}\n" if backup.is_file() else ""
         raise DataError(
             f"{len(seen)} of the {len(paths)} trajectories of split {protocol.split} were trained on, first "
             f"{manifest.relative(seen[0])}.\n"
-            f"Was {manifest.folder} divided anew after the training? These figures would say nothing of new videos.\n"
+            f"Was {manifest.folder} split again after the training? These figures would say nothing about new videos.\n"
             f"{first_one}Evaluate other data: data.folder=FOLDER\n"
             "Or measure these on purpose, marked as such: protocol.split=train, or force=true"
         )

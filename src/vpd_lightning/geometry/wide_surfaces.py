@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 _NUM_TANGENT_PLANES = 4
-"""Nearest points of a wide surface whose tangent planes a doubtful point is held against."""
+"""Number of nearest points of a wide surface to whose tangent planes a doubtful point is compared."""
 
 _MIN_STRAIGHTNESS = 0.7071067811865476
 """Cosine of 45 degrees: where a row or column of pixels bends by more between its steps, two surfaces meet."""
@@ -17,7 +17,7 @@ _MAX_STEP_RATIO = 4.0
 slowly but for the last two before its horizon. A body's edge may point along the jump, so that directions agree."""
 
 _MAX_SURFACE_POINTS = 2000
-"""A wide surface is flat where it is held against; this many of its points are enough and keep the search cheap."""
+"""Points of a wide surface that the search uses: it is locally flat, so these are enough and keep the search cheap."""
 
 
 def wide_surfaces(
@@ -42,7 +42,7 @@ def wide_surfaces(
     covers) of the tangent plane of a near point of it, from whatever view: image borders, and the seam at the foot of a
     body.
 
-    One time step is enough, cameras may move, and nothing is said of directions: a wall is as good as a floor.
+    One time step is enough, cameras may move, and no orientation is assumed: walls are found as well as floors.
     """
     shape = valid.shape
     index = np.arange(valid.size).reshape(shape)

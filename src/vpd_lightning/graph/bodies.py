@@ -17,7 +17,7 @@ _SPARSEST = 2.5
 """How many times the usual spacing particles may lie apart where cameras see a surface from the side."""
 
 _JOIN_SHARE = 0.8
-"""Islands between which at least this share of the pairs is not hollow are parts of one body."""
+"""Islands between which at least this share of the pairs is not concave are parts of one body."""
 
 _PART_SHARE = 0.25
 """An island of at most this share of another one may be a sparsely seen part of it."""
@@ -47,13 +47,14 @@ def label_bodies(
     """Return the body of each particle, from 0 (the one with most particles) on; -1 where ``mask`` is false.
 
     Two particles are linked where they lie within ``link`` spacings of each other and the surface between them is not
-    hollow: (n_i - n_j) . (x_i - x_j) / |x_i - x_j| is at least ``-max_concavity`` (after the convexity criterion of
-    Stein et al. 2014, "Object partitioning using local convexity"). Bodies that touch meet in a hollow. A particle with
-    more than ``max_concave_share`` of hollow pairs links with none: in a touch there may be a single pair that is not.
-    Islands between which nearly all pairs are not hollow are joined again, and neighbours of one colour each, the same:
-    hollow bodies, which convexity alone would divide. So two bodies of one colour that touch are taken for one.
-    What is in no island of some size, and islands beyond ``num_bodies``, joins the nearest body. Scene by scene, on
-    the CPU; the numbers do not depend on the order of the particles, on the place of the world or its scale.
+    concave: (n_i - n_j) . (x_i - x_j) / |x_i - x_j| is at least ``-max_concavity`` (after the convexity criterion of
+    Stein et al. 2014, "Object partitioning using local convexity"). Bodies touch in a concave seam. A particle
+    with more than ``max_concave_share`` of concave pairs is linked with none: at a contact, one pair that is not
+    concave would be enough to join two bodies. Islands are merged again if nearly all pairs between them are not
+    concave, or if they are close and of one and the same colour: parts of a concave body, which convexity alone would
+    divide. So two touching bodies of one colour are taken for one. Particles in no island of some size, and islands
+    beyond ``num_bodies``, join the nearest body. Scene by scene, on the CPU; the numbers do not depend on the order of
+    the particles, nor on the world's origin or scale.
     """
     labels = torch.full(mask.shape, -1, dtype=torch.int64)
     for member, own in enumerate(mask.cpu()):
@@ -76,7 +77,7 @@ def _islands(senders: np.ndarray, receivers: np.ndarray, count: int) -> np.ndarr
 def _joined(
     islands: np.ndarray, senders: np.ndarray, receivers: np.ndarray, smooth: np.ndarray, max_share: float
 ) -> np.ndarray:
-    """Join islands between which nearly all pairs of particles are not hollow: parts of one body.
+    """Join islands between which nearly all pairs of particles are not concave: parts of one body.
 
     One of the two must have at most ``max_share`` of the particles of the other. Stray particles would be bridges.
     """

@@ -73,9 +73,9 @@ def build_graph(
     """Build the graph of each batch member and put them side by side (paper section 3.2, Graph construction).
 
     ``num_abstract_nodes`` of the valid current particles (all, where there are fewer) are chosen uniformly without
-    replacement. Each valid particle of both times is tied to its nearest abstract nodes, at most
-    ``max_abstract_neighbors`` and within ``r_s`` metres; current particles get the same ties backwards. Abstract
-    nodes within ``r_a_s`` metres of each other are tied in both directions, all of them, without self loops; with
+    replacement. Each valid particle of both times is connected to its nearest abstract nodes, at most
+    ``max_abstract_neighbors`` and within ``r_s`` metres; current particles get the reverse edges, too. Abstract
+    nodes within ``r_a_s`` metres of each other are connected in both directions, all of them, without self loops; with
     ``max_abstract_edges_per_node`` each receives from that many nearest ones only.
     Indices into particles count ``batch * particle``; padding has no edges.
 

@@ -12,17 +12,17 @@ from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.types import SimulatorOutput, VideoBatch
 
 _OUTLIER = 0.05
-"""Evidence that every particle has from nowhere: what is hidden in the later frame costs a bounded amount."""
+"""Added to the evidence of every particle, so that one hidden in the later frame costs a bounded amount."""
 
 
 class MotionLoss(AbstractLoss):
-    """Negative log-evidence of predicted particles among the points seen at that step, and of these among those.
+    """Negative log-evidence of predicted particles given the points seen at that step, and of these given those.
 
     The evidence of a particle is the sum of Gaussian kernels in space (``scales``, metres) and colour
     (``color_scale``) at the points that may move in the later frame, as in coherent point drift (Myronenko and Song
-    2010); points are held against particles in the same way, so that none of them is left over. Averaged over scales:
-    the widest gives a direction from afar, the narrowest a place. Neither masks nor tracks are used, only depth and
-    colour of the frames that a video has anyway.
+    2010); that of a point is the same sum at the particles, so that no point is left unexplained. Averaged over scales:
+    the widest gives a direction from afar, the narrowest a precise position. Neither masks nor tracks are used, only
+    depth and colour of the frames that a video has anyway.
     """
 
     # Paper: trains on colours of rendered rays alone. There, motion reaches the dynamics only through the renderer.

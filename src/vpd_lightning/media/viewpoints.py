@@ -65,8 +65,8 @@ def _viewpoints_of_file(path: Path, num_frames: int | None) -> Viewpoints:
         return Viewpoints(cameras, False, None, names, [f"camera {number}" for number in range(count)])
     if num_frames is not None and count < num_frames:
         raise ConfigError(
-            f"{path} has {count} places of a moving camera; {num_frames} frames are filmed.\n"
-            f"Lower num_steps to {count - 1}, or add places, or stop time with freeze_step."
+            f"{path} has {count} poses of a moving camera, but {num_frames} frames are to be filmed.\n"
+            f"Lower num_steps to {count - 1}, or add poses, or stop time with freeze_step."
         )
     kept = cameras[:num_frames]
     return Viewpoints(kept, True, None, ["path"], [f"place {place}" for place in range(kept.shape[0])])

@@ -56,7 +56,7 @@ class SampleMetric(Metric):
         return torch.float32 if self.info.subject == "image" else torch.float64
 
     def sync(self, *args: Any, **kwargs: Any) -> None:
-        """Gather the samples of all processes; one that has none takes part with nothing, of the right kind."""
+        """Gather the samples of all processes; one without samples contributes empty tensors of the right type."""
         kinds = {"samples": torch.int64, "shapes": torch.int64, "values": self._value_dtype}
         for name, dtype in kinds.items():
             if isinstance(getattr(self, name), list) and not getattr(self, name):

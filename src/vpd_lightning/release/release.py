@@ -110,11 +110,11 @@ def _require_plain_test(metrics: Mapping[str, Any], path: Path, checkpoint: Path
         raise ConfigError(f"{path} was measured with {differs[0]}={metrics[differs[0]]}.\n{again}")
     split = metrics["protocol"].get("split")
     if split != "test":
-        raise ConfigError(f"{path} is about the {split} split, and a card about the test split.\n{again}")
+        raise ConfigError(f"{path} is about the {split} split; a card reports the test split.\n{again}")
     count = (metrics.get("seen_in_training") or {}).get("trajectories")
     if count:
         raise ConfigError(
-            f"{path} is about trajectories of which {count} were trained on, and a card about new ones.\n"
+            f"{path} includes {count} trajectories that were trained on; a card reports unseen ones only.\n"
             "Measure it on a test split that no training saw; `vpd-eval data.folder=FOLDER` chooses the data set."
         )
 
@@ -162,7 +162,7 @@ def write_release(
     )
     left = [*absolute_paths(config, "config"), *absolute_paths(figures, "metrics")]
     if left:
-        raise ConfigError(f"{left[0]} names a place of this machine.\nTrain with relative paths, then export.")
+        raise ConfigError(f"{left[0]} is a path of this machine.\nTrain with relative paths, then export.")
     for file, text in content.items():
         (folder / file).write_bytes(text)
     (folder / INDEX_FILE).write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")

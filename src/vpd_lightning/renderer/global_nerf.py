@@ -50,7 +50,7 @@ class GlobalNeRFRenderer(AbstractRenderer):
 
     # Paper: "a NeRF conditioned on the latent" and no more; sizes, tiers and encodings are those of the paper's own
     # renderer, with NeRF's ten octaves of the place, which that one does not need. The root is ours: with entries of
-    # 1/16 the scenes' vectors hardly reached the picture, and in training they fell together to a single one.
+    # 1/16 the scenes' vectors hardly influenced the image, and in training they collapsed to a single one.
     # Paper: VPD's coarse tier has the layer of 128 before its colour; this one takes its colour from the trunk, as
     # jaxnerf does without view directions. The coarse colour is trained on and never shown.
 

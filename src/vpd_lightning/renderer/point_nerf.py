@@ -39,8 +39,8 @@ from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
 class PointNeRFRenderer(AbstractRenderer):
     """Renders rays as the paper's appendix (VPD implementation details, Renderer) and jaxnerf do.
 
-    A coarse tier of ``num_coarse_samples`` stratified samples without view directions locates where light is stopped;
-    the fine tier looks at the same samples and ``num_fine_samples`` more, drawn where the coarse weights are, with
+    A coarse tier of ``num_coarse_samples`` stratified samples without view directions locates where light is absorbed;
+    the fine tier evaluates the same samples and ``num_fine_samples`` more, drawn from the coarse weights, with
     view directions. The coarse samples' neighbours and features are used again by the fine tier.
 
     # Paper: exact instead of approximate nearest neighbours (the paper's search is not published).

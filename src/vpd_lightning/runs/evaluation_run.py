@@ -22,7 +22,7 @@ from vpd_lightning.runs.threads import set_threads
 if TYPE_CHECKING:
     from vpd_lightning.evaluation.evaluate import Evaluation
 
-# What measures and draws is imported where it is used: the first line shall not wait for it.
+# Modules that measure and draw are imported where they are used, so that the first line is printed at once.
 
 _DEFAULT_SYSTEM = "vpd"  # checkpoints from before there were others do not say
 

@@ -165,7 +165,7 @@ def load_pretrained(system: AbstractSystem, checkpoint: Path, config: Mapping[st
     homeless = sorted(name for name in weights if name not in own)
     if homeless:
         raise CheckpointError(
-            f"{checkpoint} holds {homeless[0]}, for which the second training's model has no place.\n"
+            f"{checkpoint} holds {homeless[0]}, a weight that the second training's model does not have.\n"
             "Both trainings need the same encoder and renderer; see pretraining.settings."
         )
     try:
@@ -250,7 +250,7 @@ def _seconds_used(run: Path, config: Mapping[str, Any]) -> float:
 def _require_time_left(seconds: float, minutes: float | None) -> None:
     if minutes is not None and seconds >= 60.0 * minutes:
         raise ConfigError(
-            f"the first training and what was made of it took {seconds:.0f} s, all of the time budget of"
-            f" {60.0 * minutes:.0f} s.\n"
+            f"the first training and the preparation of the second took {seconds:.0f} s: nothing is left of the time"
+            f" budget of {60.0 * minutes:.0f} s.\n"
             "Raise callbacks.time_budget.minutes, or lower pretraining.share."
         )

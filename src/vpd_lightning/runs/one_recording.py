@@ -21,7 +21,7 @@ def load_particle_simulator(config: Mapping[str, Any]) -> LoadedModel:
     model = load_model(config["ckpt"], config["device"], config["change"], sleeping=config["sleeping"])
     if not isinstance(model.simulator, Simulator):
         raise ConfigError(
-            f"{model.path} predicts the videos of its own cameras and knows no others: there is nothing to film.\n"
+            f"{model.path} predicts video for its own cameras only; it cannot render other views.\n"
             "vpd-eval shows its predictions beside the truth."
         )
     return model

@@ -38,13 +38,13 @@ def chosen_precision(trainer: Mapping[str, Any], recorded: Path | None) -> tuple
         import torch
 
         is_native = torch.cuda.is_bf16_supported(including_emulation=False)
-        return (BFLOAT16, "this GPU multiplies bfloat16") if is_native else (FLOAT32, "this GPU has no bfloat16")
+        return (BFLOAT16, "this GPU supports bfloat16") if is_native else (FLOAT32, "this GPU lacks bfloat16")
     if device == "cpu":
         found = bfloat16_instructions()
         if found:
             return BFLOAT16, f"this processor multiplies bfloat16: {found}"
-        return FLOAT32, "this processor has no products in bfloat16"
-    return FLOAT32, f"nothing is known of bfloat16 on accelerator {device}"
+        return FLOAT32, "this processor has no bfloat16 instructions"
+    return FLOAT32, f"bfloat16 support of accelerator {device} is unknown"
 
 
 def bfloat16_instructions() -> str:

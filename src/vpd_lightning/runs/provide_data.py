@@ -33,11 +33,11 @@ def provide_data(config: Mapping[str, Any], overrides: Sequence[str] | None = No
     if not wanted["when_missing"]:
         raise DataError(
             f"{missing}\nMake it: {command}\n"
-            "Or look first whether everything works, with a tiny one that makes itself: budget=tiny"
+            "Or first check that everything works, on a tiny data set that is generated automatically: budget=tiny"
         )
     if not _may_fill(folder, config, overrides):
         raise DataError(
-            f"{missing}\nA folder that is given by name is not filled by itself. Correct data.folder,\n"
+            f"{missing}\nA folder that is given by name is not generated automatically. Correct data.folder,\n"
             f"or make it: {command}\nor have it made: generate.when_missing=true"
         )
     if int(os.environ.get("LOCAL_RANK", "0")) > 0:

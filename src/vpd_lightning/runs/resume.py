@@ -14,7 +14,7 @@ OVERRIDES_FILE = "overrides.yaml"
 def resumed_overrides(overrides: Sequence[str]) -> list[str]:
     """Return the overrides of the run to go on with, followed by the new ones; without ``resume``, the given ones.
 
-    ``resume=FOLDER`` names a run folder, ``resume=last`` the youngest one (of the experiment, where one is given),
+    ``resume=FOLDER`` names a run folder, ``resume=last`` the latest one (of the experiment, where one is given),
     ``resume=auto`` goes on with ``run.folder`` where that holds a checkpoint and starts it otherwise (the caller makes
     room where a run died there before its first checkpoint).
 

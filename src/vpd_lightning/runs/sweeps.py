@@ -66,7 +66,7 @@ def sweep_jobs(overrides: Sequence[str], config_dir: str | None) -> list[SweepJo
             raise ConfigError(
                 f"two jobs of the sweep would share the folder {job.name}:\n"
                 f"'{' '.join(twin.words)}' and '{' '.join(job.words)}'.\n"
-                "evaluate, num_threads and debug do not name a folder: give them one value each, and others once."
+                "evaluate, num_threads and debug are not in the folder name: give each one value, and every key once."
             )
         jobs.append(job)
     return jobs
@@ -118,7 +118,7 @@ def _attend_to(job: SweepJob, number: str, train: Callable[[list[str]], None]) -
         with _locked(job.sweep_folder / _LOCKS / "data", is_patient=True):
             provide_data(job.config, job.words)
         train([*job.words, *_settled(job.config), "resume=auto", f"run.folder={quote(str(job.folder))}"])
-        (job.folder / FINISHED).write_text("Nothing is left to do here: the sweep passes this run by.\n")
+        (job.folder / FINISHED).write_text("This run is complete: the sweep skips it.\n")
         return RESUMED if is_resumed else DONE
 
 
@@ -153,7 +153,7 @@ def _refuse_words(overrides: Sequence[str]) -> None:
         raise ConfigError("a named sweep goes on by itself.\nRemove resume.")
     if launcher := next((word for word in overrides if word.startswith(("hydra/launcher=", "hydra.launcher"))), ""):
         raise ConfigError(
-            f"'{launcher}' does not serve a named sweep, whose jobs run one after the other.\n"
+            f"'{launcher}' cannot be used with a named sweep, whose jobs run one after the other.\n"
             "Start the same command several times, one per core, GPU or node: each takes what no other has."
         )
 

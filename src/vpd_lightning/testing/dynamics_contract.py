@@ -90,7 +90,7 @@ class DynamicsContract(Contract):
 
     def test_a_batch_equals_its_members(self) -> None:
         dynamics, (previous, current) = self.built(), self.particles(3)
-        # Members that differ in their padding must not feel that they lie side by side.
+        # Members with different padding must not influence each other in a batch.
         current = replace(current, mask=torch.cat([current.mask[:2], sets.only_valid(current, 25).mask[2:]]))
         together = self.roll(dynamics, previous, current)[-1]
         for index in range(3):

@@ -56,7 +56,7 @@ class RendererContract(Contract):
 
     def test_a_batch_equals_its_members(self) -> None:
         renderer, particles, rays = self.built(), self.particles(3), self.rays(3)
-        # Members that differ in their padding must not feel that they lie side by side.
+        # Members with different padding must not influence each other in a batch.
         particles = replace(particles, mask=torch.cat([particles.mask[:2], sets.only_valid(particles, 25).mask[2:]]))
         for keys in (None, keys_for(3)):
             together = renderer(particles, rays, keys)

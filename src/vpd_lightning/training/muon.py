@@ -1,8 +1,8 @@
 """Muon for matrices and Adam for all other weights, as one optimiser.
 
 Muon (Jordan et al. 2024, https://kellerjordan.github.io/posts/muon) takes the momentum of a matrix's gradient and makes
-it orthogonal before the step: all its singular values become one. What particles have in common is the largest part of
-the pixels' gradient by far; Adam lets it decide the step, here it is one direction among many.
+it orthogonal before the step: all its singular values become one. The part of the pixel
+gradient that all particles have in common is the largest by far: it dominates a step of Adam, but not one of Muon.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -31,9 +31,9 @@ class AbstractOptimization(ABC):
         self.stage_multipliers = dict(stage_multipliers)
 
     def freeze(self, simulator: nn.Module) -> None:
-        """Freeze the stages whose multiplier is 0: else their gradients are computed, and count when they are clipped.
+        """Freeze the stages whose multiplier is 0; else their gradients would be computed, and would count in clipping.
 
-        Before the model is given to several processes, which must know what learns.
+        To be called before DistributedDataParallel wraps the model, because it must know which parameters are trained.
 
         Raises:
             ConfigError: nothing is left that learns.

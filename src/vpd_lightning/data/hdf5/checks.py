@@ -74,7 +74,7 @@ def _not_its_fault(path: Path, error: BaseException) -> BrokenFileError | None:
         path,
         "unreadable",
         f"cannot be read: {os.strerror(number)} ({brief(error)})",
-        "Nothing says that it is damaged. Mend what the system complains about, then try again.",
+        "The file itself may be intact. Fix the error that the system reports, then try again.",
     )
 
 
@@ -102,7 +102,7 @@ def open_file(path: Path) -> h5py.File:
             if file.userblock_size:
                 raise refuse(path, "user_block", f"starts with {file.userblock_size} bytes that are not HDF5")
             if not global_heaps_valid(path):
-                raise refuse(path, "damaged_file", "is damaged (where its texts are kept)", _COPY_AGAIN)
+                raise refuse(path, "damaged_file", "is damaged (in its string storage)", _COPY_AGAIN)
             check_links(path, file)
     except BaseException:
         file.close()
@@ -130,7 +130,7 @@ def _check_tree(path: Path, group: h5py.Group, seen: set[int], depth: int) -> No
             raise refuse(path, "named_type", f"{name!r} is a named datatype; only groups and data sets are allowed")
         if isinstance(member, h5py.Group):
             if _address(member) in seen or depth >= _MAX_DEPTH:
-                raise refuse(path, "cyclic_groups", f"{name!r} is a group that is entered twice or lies too deep")
+                raise refuse(path, "cyclic_groups", f"{name!r} is a group that is linked twice or nested too deep")
             seen.add(_address(member))
             _check_tree(path, member, seen, depth + 1)
 
@@ -149,7 +149,7 @@ def checked_dataset(
     if not any(stored_type.equal(h5py.h5t.py_create(np.dtype(dtype))) for dtype in dtypes):
         allowed = " or ".join(str(np.dtype(dtype)) for dtype in dtypes)
         given = getattr(dataset, "dtype", "unknown")
-        given = f"{given} (a type of its own)" if str(given) in allowed else given
+        given = f"{given} (a user-defined type)" if str(given) in allowed else given
         raise refuse(path, "wrong_dtype", f"{name!r} has dtype {given}; it must be {allowed}")
     if stored_type.committed():
         raise refuse(path, "named_type", f"{name!r} uses a named datatype; that is not allowed")
@@ -180,7 +180,7 @@ def _check_storage(path: Path, name: str, dataset: h5py.Dataset) -> None:
             # The size of a chunk, by which lzf enlarges its memory until the data fit: 0 would never end.
             expected = int(np.prod(creation.get_chunk(), dtype=object)) * dataset.id.get_type().get_size()
             if len(values) < 3 or values[2] != expected:
-                raise refuse(path, "filter_options", f"{name!r} has options {values} of lzf that do not fit its chunks")
+                raise refuse(path, "filter_options", f"{name!r} has lzf options {values} that do not match its chunks")
 
 
 def _check_size(path: Path, name: str, dataset: h5py.Dataset) -> None:
@@ -222,7 +222,7 @@ def checked_attribute(path: Path, owner: h5py.Group | h5py.Dataset, name: str, k
     dtype, shape = identifier.dtype, identifier.shape
     if kind == "text":
         if h5py.check_string_dtype(dtype) is None or shape != ():
-            raise refuse(path, "wrong_attribute", f"attribute {name!r} is {dtype} {shape}; it must be one text")
+            raise refuse(path, "wrong_attribute", f"attribute {name!r} is {dtype} {shape}; it must be a single string")
         value = owner.attrs[name]
         if len(value) > MAX_ATTRIBUTE_BYTES:  # texts of any length count as 16 bytes above
             raise too_large

@@ -19,9 +19,9 @@ class BodyForces(nn.Module):
     spin by the torque about the body's centre through the inverse inertia, so that a contact at a few particles
     moves and turns the whole body (Newton-Euler). One more force acts at the centre, without torque, as weight does,
     and one acceleration is the same for all bodies, always: what it is, and where it points, is learned. Forces are at
-    most ``residual_share`` of ``force_scale`` (metres per step squared), which bounds the acceleration: while it is not
-    known, they must not try to stand in for it.
-    Damping scales what was carried: impacts and friction remove motion
+    most ``residual_share`` of ``force_scale`` (metres per step squared), which bounds the common acceleration:
+    until that is learned, the other forces must not replace it.
+    Damping scales the carried velocity: impacts and friction remove motion
     in proportion to it. Zero-initialised: no force, hardly any damping (0.7 % a step).
     """
 
@@ -124,7 +124,7 @@ class BodyForces(nn.Module):
         )
 
     def _clearance(self, contacts: Contacts, mask: Tensor, share: Tensor) -> Tensor:
-        """Lowest distance of the body's probes to what stands still: is anything touching at all?"""
+        """Smallest distance from the body's probes to a static surface, in units of ``contact_range``."""
         belongs = mask[:, None] & (share > 1e-3 * share.amax(dim=-1, keepdim=True))
         distances = contacts.distances[:, None].expand_as(share)
         lowest = distances.masked_fill(~belongs, self.contact_range).amin(dim=-1, keepdim=True)

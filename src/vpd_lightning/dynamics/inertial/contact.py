@@ -142,13 +142,13 @@ class _Pairs:
 
 
 class ContactSolver:
-    """Corrects the motion of one step so that no probe ends up inside what stands still or inside another body.
+    """Corrects the motion of one step so that no probe penetrates a static surface or another body.
 
     Position-based dynamics (Mueller et al. 2007, 2020): each round takes the deepest probe of each body and applies
-    the smallest push at that point that lifts it out, to displacement, spin and stretch alike, and a push against its
-    sliding of at most friction times that (Coulomb). Bodies push each other with equal and opposite impulses, so that
-    momentum is kept. What is carried on to the next step has lost the motion into the surface, but for the share that
-    restitution gives back of what came faster than ``rest_speed`` (metres per step). Probes that were deeper than
+    the smallest impulse at that point that resolves it, to displacement, spin and stretch alike, and a friction impulse
+    of at most the friction coefficient times that (Coulomb). Bodies push each other with equal and opposite impulses,
+    so that momentum is kept. The velocity carried to the next step has no component into the surface; of the approach
+    speed above ``rest_speed`` (metres per step) the share ``restitution`` is given back. Probes that were deeper than
     ``max_depth`` (metres) before the step are left alone: their surface is not to be trusted.
     """
 

@@ -32,14 +32,14 @@ _PAIR_REACH = 1.5
 
 
 _BOUNCE_SHARE = 0.3
-"""Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, or nothing ever lay still."""
+"""Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, so that bodies come to rest."""
 
 
 @dataclass(frozen=True)
 class InertialMemory:
     """What the inertial dynamics carries from step to step; gathered over the particles that may move."""
 
-    origin: Float[Tensor, "batch 1 3"]  # where all else is measured from (world coordinates)
+    origin: Float[Tensor, "batch 1 3"]  # metres, world; origin of all other positions
     index: Int[Tensor, "batch moving"]  # slots of the moving candidates among all particles
     mask: Bool[Tensor, "batch moving"]
     bodies: Float[Tensor, "batch body moving"]  # 1 where a particle belongs to a body, else 0
@@ -49,8 +49,8 @@ class InertialMemory:
     masses: Float[Tensor, "batch body 1"]
     spacing: Float[Tensor, " batch"]  # of the moving candidates (metres)
     normals: Float[Tensor, "batch moving 3"]
-    velocities: Float[Tensor, "batch moving 3"]  # metres a step, where each particle goes on by itself
-    mirrored: Bool[Tensor, "batch moving"]  # whose mirror image may be a point of the hidden side
+    velocities: Float[Tensor, "batch moving 3"]  # metres a step; used with keep_shape=false only
+    mirrored: Bool[Tensor, "batch moving"]  # true if its mirror image may lie on the hidden side
     first_features: Float[Tensor, "batch moving feature"]
     first_shade: Float[Tensor, "batch moving feature"]
     static_index: Int[Tensor, "batch static"]
@@ -63,14 +63,14 @@ class InertialDynamics(AbstractDynamics):
     """Newton's first law built in, the second learned.
 
     What may move is divided into bodies (``graph.bodies``); ``first_velocity`` estimates how each moved between the two
-    frames. Each step goes on with the carried velocity, lets ``BodyForces`` push, lets what is stretched return, keeps
-    bodies out of what stands still and of one another (``ContactSolver``), and moves their particles. How a body
-    slides, bounces, weighs and deforms is inferred from its features (``MaterialNetwork``). A body that touches
-    something and hardly moves stops (``rest_share`` of ``force_scale``). Particles that are not candidates for motion
+    frames. Each step starts from the carried velocity, adds the forces (``BodyForces``) and the elastic return of soft
+    bodies, resolves contact with static surfaces and between bodies (``ContactSolver``), and moves the particles. The
+    friction, restitution, density and stiffness of a body are inferred from its features (``MaterialNetwork``). A body
+    in contact that hardly moves stops (``rest_share`` of ``force_scale``). Particles that are not candidates for motion
     keep their place exactly. Features change only by shading: a turned surface, a moved shadow.
 
-    Neither gravity nor a floor is built in: at initialisation this is free motion that contact alone changes, but for
-    0.7 % of damping a step.
+    Neither gravity nor a floor is built in: at initialisation this is free motion, changed by contact and by 0.7 % of
+    damping a step alone.
 
     For comparisons, each part can be left out: with ``first_velocity`` null bodies start at rest; with ``keep_shape``
     false every particle goes on with its own velocity, to which it adds what its body's changes by; with
@@ -238,7 +238,7 @@ class InertialDynamics(AbstractDynamics):
         _, strains = onward.following_stretches()
         onward = BodyMotion(step.centers + step.displacements, onward.displacements, onward.spins, stretches, strains)
         memory = replace(memory, motion=onward, normals=turned, velocities=velocities)
-        # Observations turn with their bodies, or a memory built from these particles would see faces that are gone.
+        # Normals rotate with their bodies: a memory rebuilt from these particles needs those of the new pose.
         normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
         return replace(current, positions=all_positions, features=features, normals=normals), memory
 
@@ -313,17 +313,17 @@ class InertialDynamics(AbstractDynamics):
         return found if bool(found.known.any()) else None
 
     def _rested(self, resolved: Resolved) -> tuple[BodyMotion, BodyMotion]:
-        """Stop what touches something and moves by less than a fraction of what a force does in a step.
+        """Stop bodies in contact that move by less than ``rest_share`` of ``force_scale`` in a step.
 
-        Networks are never exactly zero, and a body at rest would creep; as static friction, this lets only what is
-        strong enough move it.
+        Networks are never exactly zero, and a body at rest would creep; like static friction, this suppresses small
+        motion.
         """
         slowest = self.rest_share * self.force_scale
         if slowest == 0:
             return resolved.step, resolved.onward
         gated = []
         for motion in (resolved.step, resolved.onward):
-            # A turn counts by how far it moves what is a contact range away, which is of a body's size.
+            # A rotation counts by how far it moves a point at a fifth of the contact range, about a body's size.
             square = motion.displacements.square().sum(dim=-1, keepdim=True)
             square = square + (0.2 * self.contact_range) ** 2 * motion.spins.square().sum(dim=-1, keepdim=True)
             share = torch.where(resolved.touching, square / (square + slowest**2), 1.0)

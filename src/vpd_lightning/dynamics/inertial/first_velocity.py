@@ -10,15 +10,15 @@ from torch import Tensor, nn
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rigid_fit, rotate, rotation_from_spin, weighted_sum
 from vpd_lightning.geometry.decay import decay
 
-_EVIDENCE = 0.3  # a match this strong (a perfect one counts 1) is believed by half
+_EVIDENCE = 0.3  # evidence (1: one perfect match) at which the confidence of a match is 0.5
 _NUM_SPACED = 128  # points of which the spacing is measured
-_TOO_FAR = 0.01  # where matches within a scale are believed by less than this, the body stays where it is
-_NO_MATCH = 0.1  # a body whose matches are believed by less than this was not seen before: no velocity
+_TOO_FAR = 0.01  # at a lower mean confidence of the matches the pose of the body is not updated
+_NO_MATCH = 0.1  # a body with a lower mean confidence was not seen before: no velocity
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Observed points of one frame that a match looks at: places (metres), colours in [0, 1], normals, features."""
+    """Observed points of one frame that are matched: positions (metres), colours in [0, 1], normals, features."""
 
     positions: Float[Tensor, "batch particle 3"]
     colors: Float[Tensor, "batch particle 3"]
@@ -34,7 +34,7 @@ class Surfels:
 
 @dataclass(frozen=True)
 class MatchedMotion:
-    """How far each particle came since the frame before (metres), and how far that is to be believed (0 to 1)."""
+    """Displacement of each particle since the frame before (metres), and its confidence (0 to 1)."""
 
     displacements: Float[Tensor, "batch particle 3"]
     confidence: Float[Tensor, "batch particle"]
@@ -64,8 +64,8 @@ class FirstVelocity(nn.Module):
     agreement on one motion resolves them. Then ``num_plane_rounds`` Gauss-Newton steps bring each point onto the
     tangent planes of its match (Chen and Medioni 1992), while its soft match pulls along the surface with
     ``tangential_weight``: points of two frames are never the same points, and between them a surface is known better
-    than any point. How much it pulls depends on how many colours the body has: on one colour, one place is as good as
-    another; there a turn that planes do not tell, such as the spin of a plain ball, is taken for rest
+    than any point. How much it pulls depends on how many colours the body has: on one colour, all points match
+    equally well; there a rotation that planes do not determine, such as the spin of a plain ball, is pulled to zero
     (``rest_weight``).
 
     Colours are compared as chromaticity and, more weakly, brightness, within ``color_scale``, so that shading under
@@ -173,7 +173,7 @@ class FirstVelocity(nn.Module):
         radii: Float[Tensor, "batch body"],
         smallest: Float[Tensor, "batch 1"],
     ) -> tuple[Poses, Float[Tensor, "batch particle"]]:
-        """Take one Gauss-Newton step of every body onto the surface seen before; also return belief in the matches."""
+        """Take one Gauss-Newton step of every body onto the surface seen before; also return confidences."""
         at = poses.of(some.positions, members)
         matched, evidence, weights = match(at, target, cost, scales)
         belief = believed(evidence)
@@ -243,7 +243,7 @@ def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def believed(evidence: Tensor) -> Tensor:
-    """Return how far a match is believed, from its evidence: 0 to nearly 1."""
+    """Return the confidence of a match from its evidence: from 0 to almost 1."""
     return evidence / (evidence + _EVIDENCE)
 
 

@@ -18,7 +18,7 @@ from vpd_lightning.types import Particles, RGBDFrames, require_finite
 
 
 class UnprojectingEncoder(AbstractEncoder):
-    """What encoders share whose particles are pixels: which pixels, and where they lie. A subclass brings features.
+    """Base of encoders whose particles are pixels: it chooses and unprojects them. A subclass computes features.
 
     ``num_particles`` are chosen uniformly at random among the pixels inside the workspace. With ``moving_fraction``
     (and a ``background`` model) up to that share of them is chosen among pixels that may be moving. With
@@ -27,9 +27,9 @@ class UnprojectingEncoder(AbstractEncoder):
     """
 
     # Paper: moving_fraction, background, use_normals, color_features and same_pixels are ours; the paper has none of
-    # them (None, None and three times False). Its 2^14 particles are all pixels of a camera, or many of a body's. Where
-    # a few of them are chosen twice, the centre of what is seen of a body moves by chance about as far as the body does
-    # in a step.
+    # them (None, None and three times False). Its 2^14 particles are all pixels of a camera, or many of a body's. If
+    # only a few are drawn, independently in both frames, the mean of a body's particles moves by chance about as far as
+    # the body does in a step.
 
     # What the error message names where no pixel lies in the workspace.
     _empty_advice = "Check depth (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."
@@ -181,8 +181,8 @@ def _cropped(frames: RGBDFrames, candidates: Bool[Tensor, "batch point"]) -> RGB
 def _with_border(moving: Bool[Tensor, "batch view height width"]) -> tuple[Tensor, Tensor]:
     """Return the moving pixels and those beside them that are not.
 
-    At a body's foot its depth hardly differs from what stands behind: such a pixel is neither surely moving nor surely
-    static, and with a normal between the two it would be a false wall. It becomes no particle.
+    Where a body stands on the floor its depth hardly differs from the floor's: such a pixel is neither surely moving
+    nor surely static, and its normal, a mixture of both, would make it a false wall. It becomes no particle.
     """
     grown = torch.nn.functional.max_pool2d(moving.float(), 3, stride=1, padding=1) > 0
     return moving, grown & ~moving

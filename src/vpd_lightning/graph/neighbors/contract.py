@@ -33,7 +33,7 @@ def require_finite(name: str, positions: Float[Tensor, "any 3"]) -> None:
     bad = int((~torch.isfinite(positions)).any(dim=-1).sum())
     raise NonFiniteError(
         f"Neighbour search: {bad} of {len(positions)} {name} have a coordinate that is NaN or infinite.\n"
-        "Particles left the range of numbers: a model that diverged, or damaged depth or poses.\n"
+        "Either the model diverged, or depth or camera poses are damaged.\n"
         "Lower the learning rate, clip gradients, or check the data with vpd-data validate."
     )
 

@@ -1,4 +1,4 @@
-"""Annular features in one pass, backend by backend: the rows of ``[query, neighbor, feature]`` are never written.
+"""Annular features in one pass, backend by backend: the rows of ``[query, neighbor, feature]`` are never materialised.
 
 ``annular_features`` is the definition; every backend here has its shapes, its conventions and its gradients. Kept for
 the backward pass are the inputs and the neighbours' indices in 4 bytes each (the definition keeps 19 numbers per

@@ -1,6 +1,6 @@
 """Annular features of the samples of a ray, compiled: distances, choice, kernels and sums of one sample at a time.
 
-The twin of the plain sums in ``ray_candidates``, for float32 on a CPU. Nothing but the result is written down, and the
+The twin of the plain sums in ``ray_candidates``, for float32 on a CPU. Nothing but the result is stored, and the
 backward pass computes weights again, so that training keeps no ``[ray, sample, candidate, kernel]`` either.
 """
 

@@ -30,7 +30,7 @@ def fine_samples(
     num_samples: int,
     quantiles: Float[Tensor, "batch ray fine"] | None,
 ) -> Float[Tensor, "batch ray fine"]:
-    """Return distances (metres) where the coarse tier's ``weights`` are; evenly spread without ``quantiles``."""
+    """Return distances (metres) drawn from the coarse tier's ``weights``; at even quantiles without ``quantiles``."""
     # As jaxnerf: bins between the midpoints of coarse samples, so the first and last weight have none.
     middles = ((t_coarse[..., 1:] + t_coarse[..., :-1]) / 2).flatten(0, 1)
     u = even_quantiles(num_samples, len(middles), middles.device) if quantiles is None else quantiles.flatten(0, 1)

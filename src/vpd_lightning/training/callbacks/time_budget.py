@@ -76,7 +76,7 @@ class TimeBudget(pl.Callback):
         if datamodule.num_workers:
             raise ConfigError(
                 "data.num_steps_schedule follows the time that callbacks.time_budget.minutes allows, which the"
-                f" {datamodule.num_workers} processes that read data do not know.\n"
+                f" {datamodule.num_workers} processes that read data cannot see.\n"
                 "Set data.num_workers=0, or data.num_steps_schedule=null."
             )
         datamodule.share_done = lambda: min(1.0, self.seconds / (self.seconds_allowed or 1.0))
