@@ -67,11 +67,11 @@ def edge_counts(model: HierarchicalGNNDynamics, previous: Particles, current: Pa
     now = current.positions[0][current.mask[0]]
     chosen = now[:: max(1, len(now) // model.num_abstract_nodes)][: model.num_abstract_nodes]
 
-    def ties(positions: Tensor) -> int:
+    def num_edges(positions: Tensor) -> int:
         return int((nearest(chosen, positions, model.max_abstract_neighbors)[1] <= model.r_s).sum())
 
     among = len(pairs_within(chosen, model.r_a_s)[0])
-    return EdgeCounts(len(before), len(now), len(chosen), ties(before), ties(now), among)
+    return EdgeCounts(len(before), len(now), len(chosen), num_edges(before), num_edges(now), among)
 
 
 def encoder_layers(encoder: UNetEncoder, height: int, width: int, num_images: int) -> list[Layer]:
@@ -87,19 +87,19 @@ def encoder_layers(encoder: UNetEncoder, height: int, width: int, num_images: in
 
 def dynamics_layers(model: HierarchicalGNNDynamics, counts: EdgeCounts, is_plain: bool = False) -> list[Layer]:
     """Return all layers of one step; ``is_plain`` multiplies concatenated edges instead of their parts."""
-    ties = {"previous": counts.previous_to_abstract, "current": counts.current_to_abstract}
+    num_edges = {"previous": counts.previous_to_abstract, "current": counts.current_to_abstract}
     nodes = {"previous": counts.previous, "current": counts.current}
     layers = []
     for name in ("previous", "current"):
         layers += _mlp(model.encode_node[name], nodes[name])
-        layers += _mlp(model.encode_edge[f"{name}_to_abstract"], ties[name])
-        layers += _edges(model.update_edge[f"{name}_to_abstract"], ties[name], (nodes[name],), is_plain)
+        layers += _mlp(model.encode_edge[f"{name}_to_abstract"], num_edges[name])
+        layers += _edges(model.update_edge[f"{name}_to_abstract"], num_edges[name], (nodes[name],), is_plain)
     layers += _mlp(model.update_node["abstract_first"].mlp, counts.abstract)
     layers += _mlp(model.encode_edge["abstract_to_abstract"], counts.abstract_to_abstract)
     layers += among_abstract_layers(model, counts, is_plain)
-    layers += _mlp(model.encode_edge["abstract_to_current"], ties["current"])
+    layers += _mlp(model.encode_edge["abstract_to_current"], num_edges["current"])
     both = (counts.abstract, counts.current)
-    layers += _edges(model.update_edge["abstract_to_current"], ties["current"], both, is_plain)
+    layers += _edges(model.update_edge["abstract_to_current"], num_edges["current"], both, is_plain)
     layers += _mlp(model.update_node["current"].mlp, counts.current)
     decoders = [model.decode_location, model.decode_feature]
     return layers + [layer for mlp in decoders if mlp is not None for layer in _mlp(mlp, counts.current)]

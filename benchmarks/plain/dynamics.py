@@ -47,13 +47,13 @@ def _changes(
     x_abstract = x_current[chosen]
     count = len(chosen)
 
-    def ties(positions: Tensor) -> tuple[Tensor, Tensor]:
+    def edges_to_nodes(positions: Tensor) -> tuple[Tensor, Tensor]:
         """Particle and abstract node of each edge between them."""
         index, distance = nearest(x_abstract, positions, model.max_abstract_neighbors)
         near = distance <= model.r_s
         return near.nonzero()[:, 0], index[near]
 
-    previous_ties, current_ties = ties(x_previous), ties(x_current)
+    previous_edges, current_edges = edges_to_nodes(x_previous), edges_to_nodes(x_current)
     senders, receivers = pairs_within(x_abstract, model.r_a_s)
 
     v_previous = model.encode_node["previous"](z_previous)
@@ -61,8 +61,8 @@ def _changes(
 
     messages = v_current.new_zeros(count, v_current.shape[1])
     for name, x, v, (particle, node) in (
-        ("previous_to_abstract", x_previous, v_previous, previous_ties),
-        ("current_to_abstract", x_current, v_current, current_ties),
+        ("previous_to_abstract", x_previous, v_previous, previous_edges),
+        ("current_to_abstract", x_current, v_current, current_edges),
     ):
         edge = model.encode_edge[name](x[particle] - x_abstract[node])
         edge = _updated(model.update_edge[name], edge, torch.cat([edge, v[particle]], dim=-1))
@@ -78,7 +78,7 @@ def _changes(
         messages = torch.zeros_like(v_abstract).index_add(0, receivers, edge)
         v_abstract = _updated(update_node, v_abstract, torch.cat([v_abstract, messages], dim=-1))
 
-    particle, node = current_ties
+    particle, node = current_edges
     edge = model.encode_edge["abstract_to_current"](x_abstract[node] - x_current[particle])
     together = torch.cat([edge, v_abstract[node], v_current[particle]], dim=-1)
     edge = _updated(model.update_edge["abstract_to_current"], edge, together)

@@ -319,8 +319,8 @@ def test_the_last_round_has_the_gradients_of_finite_differences(name):
         some = replace(current, positions=values[0], colors=values[1])
         target = replace(previous, positions=values[2], colors=values[3])
         cost = model.appearance_cost(some, target)
-        found, belief = model._plane_round(poses, some, members, target, cost, scales, radii, far)
-        return found.of(some.positions, members), belief
+        found, confidences = model._plane_round(poses, some, members, target, cost, scales, radii, far)
+        return found.of(some.positions, members), confidences
 
     value = inputs[LAST_ROUND.index(name)].clone().requires_grad_()
     assert torch.autograd.gradcheck(last_round, (value,), eps=1e-7, atol=1e-4, rtol=1e-3)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.dynamics.test_first_velocity import surfels
-from vpd_lightning.dynamics.inertial.first_velocity import believed, match, point_spacing
+from vpd_lightning.dynamics.inertial.first_velocity import match, match_confidence, point_spacing
 
 
 def test_the_best_match_of_a_point_is_the_nearest_of_its_colour():
@@ -31,9 +31,9 @@ def test_the_best_match_of_a_point_is_the_nearest_of_its_colour():
         assert evidence[0, point].item() == pytest.approx(total, rel=1e-12)
 
 
-def test_belief_grows_from_zero_towards_one():
+def test_confidence_grows_from_zero_towards_one():
     evidence = torch.tensor([0.0, 0.3, 1.0, 1e6])
-    assert torch.allclose(believed(evidence), torch.tensor([0.0, 0.5, 1 / 1.3, 1.0]), atol=1e-6)
+    assert torch.allclose(match_confidence(evidence), torch.tensor([0.0, 0.5, 1 / 1.3, 1.0]), atol=1e-6)
 
 
 def test_spacing_is_the_median_distance_to_the_fourth_nearest():

@@ -28,11 +28,11 @@ class VideoDataModule(pl.LightningDataModule):
     ``batch_size`` is the global one. ``target_views`` null means all; ``start_frames`` null means every start frame
     that leaves room for the clip; ``num_trajectories`` null means the whole training split. ``num_steps_schedule``
     maps fractions of the training to rollout lengths and overrides ``num_steps`` in training (null: no schedule);
-    fractions are of ``trainer.max_steps``, or of the time where ``share_done`` is set (``callbacks.time_budget``).
-    ``moving_ray_fraction`` of the rays goes to pixels that differ from the per-camera training median by more than
-    the thresholds (largest colour channel, in [0, 1]; depth, in metres), or lie within ``moving_ray_margin`` pixels of
-    one that does. With ``cache`` decoded frames stay in memory
-    (in each loader worker; with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
+    fractions are of ``trainer.max_steps``, or of the time where ``training_progress`` is set
+    (``callbacks.time_budget``). ``moving_ray_fraction`` of the rays goes to pixels that differ from the per-camera
+    training median by more than the thresholds (largest colour channel, in [0, 1]; depth, in metres), or lie within
+    ``moving_ray_margin`` pixels of one that does. With ``cache`` decoded frames stay in memory (in each loader worker;
+    with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
     the input views' images of the frames to predict.
     """
 
@@ -80,7 +80,7 @@ class VideoDataModule(pl.LightningDataModule):
         self.num_validation_clips, self.num_validation_steps = num_validation_clips, num_validation_steps
         self.validation_views, self.load_future = validation_views, load_future
         self.num_context_frames = NUM_CONTEXT_FRAMES
-        self.share_done: Callable[[], float] | None = None
+        self.training_progress: Callable[[], float] | None = None
         self.data_sha256: str | None = None  # of the data set; known from setup on
         self.trained_on: list[str] | None = None  # SHA-256 of each trajectory that clips are drawn from; as above
         self.trajectories: list[TrajectoryFrames] = []
@@ -159,7 +159,7 @@ class VideoDataModule(pl.LightningDataModule):
             start_frames=self.start_frames,
             moving_rays=moving_rays,
             load_future=self.load_future,
-            share_done=self.share_done,
+            training_progress=self.training_progress,
         )
 
     def train_dataloader(self) -> DataLoader[VideoBatch]:

@@ -74,7 +74,8 @@ class ClipDataset(Dataset[ClipSample]):
     context, and rays of frames ``start + 2 ... start + 1 + T`` of the target views with the colours seen along them.
     With ``load_future`` the input views' images of those frames come too.
 
-    ``share_done`` is asked how much of the training is done, where a clock ends it and ``max_steps`` does not tell.
+    ``training_progress`` is asked how much of the training is done, where a clock ends it and ``max_steps`` does not
+    tell.
     """
 
     def __init__(
@@ -92,7 +93,7 @@ class ClipDataset(Dataset[ClipSample]):
         start_frames: Sequence[int] | None,
         moving_rays: MovingRays | None,
         load_future: bool,
-        share_done: Callable[[], float] | None = None,
+        training_progress: Callable[[], float] | None = None,
     ) -> None:
         """Check that every trajectory has the frames, views and image size that the clips need.
 
@@ -119,7 +120,7 @@ class ClipDataset(Dataset[ClipSample]):
         self.input_views, self.target_views = list(input_views), list(target_views)
         self.start_frames = None if start_frames is None else list(start_frames)
         self.moving_rays, self.load_future = moving_rays, load_future
-        self.share_done = share_done
+        self.training_progress = training_progress
         self._moving_pixels: dict[tuple[int, int], np.ndarray] = {}
         longest = max([num_steps, *(num_steps_schedule or {}).values()])
         require_clips(self.trajectories, longest, [*self.input_views, *self.target_views], self.start_frames)
@@ -128,7 +129,7 @@ class ClipDataset(Dataset[ClipSample]):
         return self.max_steps * self.batch_size
 
     def _share_done(self, step: int) -> float:
-        return step / self.max_steps if self.share_done is None else self.share_done()
+        return step / self.max_steps if self.training_progress is None else self.training_progress()
 
     def __getitem__(self, item: int) -> ClipSample:
         step, sample_index = divmod(item, self.batch_size)

@@ -145,8 +145,8 @@ def _label(
     usual_pair = lengths <= link * usual * (1 + 1e-9)
     first, second, convex = senders[usual_pair], receivers[usual_pair], smooth[usual_pair]
     pairs = np.bincount(np.r_[first, second], minlength=count)
-    hollow = np.bincount(np.r_[first[~convex], second[~convex]], minlength=count)
-    clean = hollow <= max_concave_share * pairs
+    num_concave = np.bincount(np.r_[first[~convex], second[~convex]], minlength=count)
+    clean = num_concave <= max_concave_share * pairs
     sure = convex & clean[first] & clean[second]
     islands = _islands(first[sure], second[sure], count)
     islands = _joined(islands, first, second, convex, 1.0)

@@ -87,7 +87,7 @@ def build_graph(
     if len(generators) != batch_size:
         raise ValueError(f"One generator per batch member is needed: got {len(generators)} for {batch_size}.")
     # -1 stands for "no abstract node" until their number is known.
-    ties = {
+    abstract_neighbors = {
         name: torch.full((*particles.mask.shape, max_abstract_neighbors), -1, device=particles.mask.device)
         for name, particles in (("previous", previous), ("current", current))
     }
@@ -104,7 +104,7 @@ def build_graph(
         for name, particles in (("previous", previous), ("current", current)):
             rows = particles.mask[member].nonzero()[:, 0]
             near = index.knn(particles.positions[member].index_select(0, rows), max_abstract_neighbors, r_s)
-            ties[name][member, rows] = torch.where(near.mask, near.index + num_abstract, -1)
+            abstract_neighbors[name][member, rows] = torch.where(near.mask, near.index + num_abstract, -1)
         if max_abstract_edges_per_node is None:
             senders, receivers = PointIndex(centers, backend, is_radius=True, is_graph=True).radius(centers, r_a_s)
             is_other = senders != receivers
@@ -119,18 +119,18 @@ def build_graph(
     joined = tuple(torch.cat(column) for column in zip(*among, strict=True))
     return HierarchicalGraph(
         abstract_index=torch.cat(chosen),
-        previous_to_abstract=ties_to_abstract(ties["previous"].flatten(0, 1), num_abstract),
-        current_to_abstract=ties_to_abstract(ties["current"].flatten(0, 1), num_abstract),
+        previous_to_abstract=edges_to_abstract(abstract_neighbors["previous"].flatten(0, 1), num_abstract),
+        current_to_abstract=edges_to_abstract(abstract_neighbors["current"].flatten(0, 1), num_abstract),
         abstract_to_abstract=(
             EdgeSet(Incidence.of(joined[0], num_abstract), Incidence.of(joined[1], num_abstract, is_sorted=True))
             if max_abstract_edges_per_node is None
             else edges_from_table(*joined)
         ),
-        is_covered=(ties["current"] >= 0).any(dim=2),
+        is_covered=(abstract_neighbors["current"] >= 0).any(dim=2),
     )
 
 
-def ties_to_abstract(table: Int64[Tensor, "particle neighbor"], num_abstract: int) -> EdgeSet:
+def edges_to_abstract(table: Int64[Tensor, "particle neighbor"], num_abstract: int) -> EdgeSet:
     """Return the edges from particles to the abstract nodes of a table that holds -1 where there is none."""
     mask = table >= 0
     receivers = torch.where(mask, table, num_abstract).flatten()

@@ -14,7 +14,7 @@ from vpd_lightning.graph.hierarchical import (
     EdgeSet,
     HierarchicalGraph,
     edges_from_table,
-    ties_to_abstract,
+    edges_to_abstract,
     without_self,
 )
 from vpd_lightning.graph.incidence import Incidence
@@ -68,12 +68,12 @@ def build_static_graph(
     is_node = current.mask.gather(1, chosen)
     centers = _usable(current.positions.gather(1, chosen[..., None].expand(-1, -1, 3)), is_node)
 
-    ties = []
+    abstract_neighbors = []
     for particles in (previous, current):
         queries = _usable(particles.positions, particles.mask)
         index, mask = _nearest(queries, centers, is_node, max_abstract_neighbors, r_s)
         mask = mask & particles.mask[..., None]
-        ties.append(torch.where(mask, index + first[..., None] * num_abstract, -1))
+        abstract_neighbors.append(torch.where(mask, index + first[..., None] * num_abstract, -1))
     if max_abstract_edges_per_node is None:
         among, dropped = _edges_within(centers, is_node, r_a_s, edge_capacity)
     else:
@@ -83,10 +83,10 @@ def build_static_graph(
         among, dropped = edges_from_table(index.flatten(0, 1), mask.flatten(0, 1)), first.new_zeros(())
     graph = HierarchicalGraph(
         abstract_index=(chosen + first * num_current).flatten(),
-        previous_to_abstract=ties_to_abstract(ties[0].flatten(0, 1), batch_size * num_abstract),
-        current_to_abstract=ties_to_abstract(ties[1].flatten(0, 1), batch_size * num_abstract),
+        previous_to_abstract=edges_to_abstract(abstract_neighbors[0].flatten(0, 1), batch_size * num_abstract),
+        current_to_abstract=edges_to_abstract(abstract_neighbors[1].flatten(0, 1), batch_size * num_abstract),
         abstract_to_abstract=among,
-        is_covered=(ties[1] >= 0).any(dim=2),
+        is_covered=(abstract_neighbors[1] >= 0).any(dim=2),
     )
     return StaticGraph(graph, dropped, _non_finite(previous) + _non_finite(current))
 

@@ -87,11 +87,11 @@ def _usage_lines(content: CardContent) -> list[str]:
     ]
 
 
-def protocol_words(of_run: Mapping[str, Any], measured: Mapping[str, Any]) -> list[str]:
+def protocol_words(run_protocol: Mapping[str, Any], measured: Mapping[str, Any]) -> list[str]:
     """Return the options with which ``vpd-eval`` gives the figures, where the run's own protocol is another."""
     # The number of trajectories in the figures is how many there were, not how many were asked for.
-    keys = [key for key in of_run if key in measured and key != "num_trajectories"]
-    return [f"protocol.{key}={measured[key]}".replace(" ", "") for key in keys if measured[key] != of_run[key]]
+    keys = [key for key in run_protocol if key in measured and key != "num_trajectories"]
+    return [f"protocol.{key}={measured[key]}".replace(" ", "") for key in keys if measured[key] != run_protocol[key]]
 
 
 def _input_line(system: str, views: list[int]) -> str:

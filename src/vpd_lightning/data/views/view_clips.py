@@ -65,7 +65,7 @@ class ViewClipDataset(Dataset[ViewSample]):
         resolution: int,
         cache: bool,
         slots: SlotStore | None,
-        share_done: Callable[[], float] | None = None,
+        training_progress: Callable[[], float] | None = None,
     ) -> None:
         """Check that every trajectory has the frames, views and image size that the clips need.
 
@@ -84,7 +84,7 @@ class ViewClipDataset(Dataset[ViewSample]):
         self.num_history, self.num_steps, self.num_steps_schedule = num_history, num_steps, num_steps_schedule
         self.frame_offset, self.resolution = frame_offset, resolution
         self.views, self.cache, self.slots = list(views), cache, slots
-        self.share_done = share_done  # of the training, where a clock ends it and not a number of steps
+        self.training_progress = training_progress  # of the training, where a clock ends it and not a number of steps
         # Frames of the recording from the first to the last of the longest clip.
         span = (num_history + max([num_steps, *(num_steps_schedule or {}).values()]) - 1) * frame_offset + 1
         require_clips(self.trajectories, 0, self.views, start_frames, num_context_frames=span)
@@ -114,7 +114,7 @@ class ViewClipDataset(Dataset[ViewSample]):
         step, sample_index = divmod(item, self.batch_size)
         place = self.place(step, sample_index)
         trajectory = self.trajectories[place.trajectory]
-        done = step / self.max_steps if self.share_done is None else self.share_done()
+        done = step / self.max_steps if self.training_progress is None else self.training_progress()
         count = self.num_history + steps_at(done, self.num_steps, self.num_steps_schedule)
         times = range(place.start, place.start + count * self.frame_offset, self.frame_offset)
         return ViewSample(

@@ -120,7 +120,7 @@ class ViewDataModule(VideoDataModule):
             resolution=self.resolution,
             cache=self.cache_images,
             slots=self.slots,
-            share_done=self.share_done,
+            training_progress=self.training_progress,
         )
 
     def _collate(self) -> Callable[[Sequence[Any]], Any]:

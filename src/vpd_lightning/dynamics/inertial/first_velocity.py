@@ -120,9 +120,9 @@ class FirstVelocity(nn.Module):
             poses, scales = self._anneal(some, members, target, cost, radii, smallest)
             for _ in range(self.num_plane_rounds - 1):
                 poses, _ = self._plane_round(poses, some, members, target, cost, scales, radii, smallest)
-        poses, belief = self._plane_round(poses, some, members, target, cost, scales, radii, smallest)
+        poses, confidences = self._plane_round(poses, some, members, target, cost, scales, radii, smallest)
         count = members.sum(dim=2).clamp(min=1)
-        confidence = (members * belief[:, None]).sum(dim=2) / count
+        confidence = (members * confidences[:, None]).sum(dim=2) / count
         known = torch.sigmoid((confidence - _NO_MATCH) / 0.02) * target.mask.any(dim=1, keepdim=True)
         was = poses.of(current.positions, bodies)
         share = (bodies * known[..., None]).sum(dim=1)
@@ -139,7 +139,7 @@ class FirstVelocity(nn.Module):
         for scale in self.match_scales:
             scales = torch.maximum(scale * radius, smallest).clamp(min=1e-9)
             matched, evidence, _ = match(poses.of(some.positions, members), target, cost, scales)
-            weights = members * believed(evidence)[:, None]
+            weights = members * match_confidence(evidence)[:, None]
             # Soft matches always lie somewhere: a body that was not seen before must not jump onto another.
             is_near = weights.sum(dim=2) / count > _TOO_FAR
             poses = _where(is_near, Poses(*rigid_fit(some.positions, matched, weights + 1e-6 * members)), poses)
@@ -176,15 +176,15 @@ class FirstVelocity(nn.Module):
         """Take one Gauss-Newton step of every body onto the surface seen before; also return confidences."""
         at = poses.of(some.positions, members)
         matched, evidence, weights = match(at, target, cost, scales)
-        belief = believed(evidence)
+        confidences = match_confidence(evidence)
         # Mean planes, not that of the best match: two points may be equally good, and rounding would choose.
         normals = weights @ target.normals
         middle = _masked_mean(target.positions, target.mask)
         heights = weights @ ((target.positions - middle) * target.normals).sum(dim=-1, keepdim=True)
         off_plane = heights.squeeze(-1) - ((at - middle) * normals).sum(dim=-1)
         # A point whose plane is far off has no match there, whatever the soft match is (Geman-McClure weights).
-        trust = 1 / (1 + (off_plane.detach() / smallest.clamp(min=1e-9)).square())
-        plane_weights = belief * trust * (normals.square().sum(dim=-1) > 0.5)
+        robust_weights = 1 / (1 + (off_plane.detach() / smallest.clamp(min=1e-9)).square())
+        plane_weights = confidences * robust_weights * (normals.square().sum(dim=-1) > 0.5)
 
         centers = poses.goals
         # Turns are solved in radii of the body, so that turns and shifts are of one size in the equations.
@@ -196,7 +196,7 @@ class FirstVelocity(nn.Module):
         plane = members * plane_weights[:, None]
         variety = self._variety(some.colors, members)
         pull = self.tangential_weight * (0.1 + 0.9 * variety)
-        point_weights = members * pull[..., None] * belief[:, None]
+        point_weights = members * pull[..., None] * confidences[:, None]
         matrix = torch.einsum("bkp,bkpi,bkpj->bkij", plane, along_normal, along_normal)
         matrix = matrix + torch.einsum("bkp,bkpai,bkpaj->bkij", point_weights, along_axes, along_axes)
         right = torch.einsum("bkp,bkpi,bp->bki", plane, along_normal, off_plane)
@@ -209,7 +209,7 @@ class FirstVelocity(nn.Module):
         step = torch.linalg.solve(matrix, right)
         turn = rotation_from_spin(step[..., :3] / size[..., None])
         rotations = (turn[..., None] * poses.rotations[..., None, :, :]).sum(dim=-2)
-        return Poses(rotations, poses.centers, centers + step[..., 3:]), belief
+        return Poses(rotations, poses.centers, centers + step[..., 3:]), confidences
 
 
 def chromaticity(colors: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 6"]:
@@ -242,7 +242,7 @@ def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     return (values * mask[..., None]).sum(dim=1, keepdim=True) / mask.sum(dim=1).clamp(min=1)[:, None, None]
 
 
-def believed(evidence: Tensor) -> Tensor:
+def match_confidence(evidence: Tensor) -> Tensor:
     """Return the confidence of a match from its evidence: from 0 to almost 1."""
     return evidence / (evidence + _EVIDENCE)
 

@@ -79,7 +79,7 @@ class TimeBudget(pl.Callback):
                 f" {datamodule.num_workers} processes that read data cannot see.\n"
                 "Set data.num_workers=0, or data.num_steps_schedule=null."
             )
-        datamodule.share_done = lambda: min(1.0, self.seconds / (self.seconds_allowed or 1.0))
+        datamodule.training_progress = lambda: min(1.0, self.seconds / (self.seconds_allowed or 1.0))
 
     @staticmethod
     def _require_work_on_the_clock(trainer: pl.Trainer) -> None:
