@@ -157,6 +157,9 @@ class Simulator(AbstractSystem):
             positions=flatten([s.positions for s in states]),
             features=flatten([s.features for s in states]),
             mask=flatten([s.mask for s in states]),
+            moving=None if states[0].moving is None else flatten([s.moving for s in states]),  # type: ignore[misc]
+            normals=None if states[0].normals is None else flatten([s.normals for s in states]),  # type: ignore[misc]
+            scenery=states[0].scenery,
         )
         flat_rays = Rays(rays.origins.flatten(0, 1), rays.directions.flatten(0, 1))
         if keys is not None:  # one set of draws per (member, step); steps stay apart for up to a million steps

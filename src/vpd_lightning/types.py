@@ -1,6 +1,6 @@
 """What crosses a stage border: cameras, RGB-D frames, particles, rays, rendered rays and training batches."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -79,11 +79,34 @@ class RGBDFrames(_Border):
 
 
 @dataclass(frozen=True)
+class Scenery(_Border):
+    """What stands still in a clip: one point for almost every pixel that saw it, for the renderer alone.
+
+    ``colors`` are as observed (in [0, 1]), shadows included; ``occluders`` are points of what moved at that time, which
+    cast them. ``normals`` have unit length, zero where unknown. ``sizes`` is the width of the pixel at the point's
+    distance (metres), ``views`` the unit direction in which it was seen.
+    """
+
+    positions: Float[Tensor, "*batch point 3"]
+    colors: Float[Tensor, "*batch point 3"]
+    normals: Float[Tensor, "*batch point 3"]
+    views: Float[Tensor, "*batch point 3"]
+    sizes: Float[Tensor, "*batch point"]
+    mask: Bool[Tensor, "*batch point"]
+    occluders: Float[Tensor, "*batch occluder 3"]
+    occluder_mask: Bool[Tensor, "*batch occluder"]
+
+    def __getitem__(self, index: Any) -> "Scenery":
+        return Scenery(**{item.name: getattr(self, item.name)[index] for item in fields(self)})
+
+
+@dataclass(frozen=True)
 class Particles(_Border):
     """Latent particles, dense and padded; ``mask`` is false for padding. The batch axis may be absent.
 
     ``colors`` (observed RGB in [0, 1]), ``moving`` (may belong to something that moves) and ``normals`` (unit, zero
-    where unknown) are observations carried along for a dynamics that uses them; the paper's does not.
+    where unknown) are observations carried along for a dynamics that uses them; the paper's does not. With ``scenery``
+    particles that are not ``moving`` are for the dynamics alone: a renderer draws the scenery in their place.
     """
 
     positions: Float[Tensor, "*batch particle 3"]
@@ -92,6 +115,7 @@ class Particles(_Border):
     colors: Float[Tensor, "*batch particle 3"] | None = None
     moving: Bool[Tensor, "*batch particle"] | None = None
     normals: Float[Tensor, "*batch particle 3"] | None = None
+    scenery: Scenery | None = None
 
     def __post_init__(self) -> None:
         if self.mask is None:
@@ -101,6 +125,12 @@ class Particles(_Border):
     @property
     def num_particles(self) -> int:
         return self.positions.shape[-2]
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> "Particles":
+        """Apply a function to every tensor with a particle axis; the scenery stays."""
+        names = [item.name for item in fields(self) if item.name != "scenery"]
+        known = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return replace(self, **{name: function(value) for name, value in known.items()})
 
     def without_padding(self) -> "Particles":
         """Return the same particles with zeros in padding: NaN there would survive a product with zero."""

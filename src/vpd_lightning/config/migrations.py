@@ -42,8 +42,12 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "surface_scale": 1.0,
         "color_features": False,
         "background_frequencies": 0,
+        "facing_softness": None,
+        "num_scenery_candidates": None,
+        "num_lights": 0,
+        "shadow_softness": 0.5,
     },
-    "vpd_lightning.encoder.unet.UNetEncoder": {"color_features": False, "same_pixels": False},
+    "vpd_lightning.encoder.unet.UNetEncoder": {"color_features": False, "same_pixels": False, "has_scenery": False},
 }
 """By class: arguments added since the first checkpoints, with values that leave those models as they were."""
 

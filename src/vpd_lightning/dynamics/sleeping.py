@@ -1,7 +1,7 @@
 """Sleeping particles, as physics engines have them: what has come to rest costs nothing until something comes near."""
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -294,8 +294,7 @@ def _kept(following: Particles, current: Particles, asleep: Bool[Tensor, "batch 
 
 def _taken(particles: Particles, member: int, index: Int64[Tensor, " active"]) -> Particles:
     """Return some particles of one member, as a batch of one."""
-    values = {item.name: getattr(particles, item.name) for item in fields(particles)}
-    return Particles(**{name: None if v is None else v[member][index][None] for name, v in values.items()})
+    return replace(particles.mapped(lambda values: values[member][index][None]), scenery=None)
 
 
 def _without_inner_prefix(module: Any, state: dict[str, Any], prefix: str, metadata: Any) -> None:

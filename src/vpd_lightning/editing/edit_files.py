@@ -17,7 +17,7 @@ from vpd_lightning.errors import EditError, one_line
 from vpd_lightning.files import AtomicPath
 from vpd_lightning.media.ply import write_ply
 from vpd_lightning.simulator import Scene
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Particles, Scenery
 
 VERSION = 1
 MAX_EDIT_BYTES = 1_000_000
@@ -127,8 +127,11 @@ def save_scene(path: str | Path, scene: Scene) -> None:
         particles = getattr(scene, frame)
         for item in fields(particles):
             value = getattr(particles, item.name)
-            if value is not None:
+            if isinstance(value, Tensor):
                 arrays[f"{frame}_{item.name}"] = value.detach().cpu().numpy()
+        if (scenery := particles.scenery) is not None:
+            for item in fields(scenery):
+                arrays[f"{frame}_scenery_{item.name}"] = getattr(scenery, item.name).detach().cpu().numpy()
     with AtomicPath(Path(path)) as partial, partial.open("wb") as stream:
         np.savez_compressed(stream, **arrays)
 
@@ -174,7 +177,30 @@ def _frame(path: Path, arrays: Any, frame: str) -> Particles:
     if not fits:
         shapes = {name: tuple(value.shape) for name, value in values.items()}
         raise EditError(f"{path} is no scene: the {frame} frame has shapes {shapes}.")
-    return Particles(**values)
+    return Particles(**values, scenery=_scenery(path, arrays, frame))
+
+
+def _scenery(path: Path, arrays: Any, frame: str) -> Scenery | None:
+    """Return the scenery of a frame; None where the file holds none.
+
+    Raises:
+        EditError: a part is missing, has another shape, or is not finite.
+    """
+    names = [item.name for item in fields(Scenery)]
+    stored = {name: arrays[key] for name in names if (key := f"{frame}_scenery_{name}") in arrays}
+    if not stored:
+        return None
+    if missing := [name for name in names if name not in stored]:
+        raise EditError(f"{path} is no scene: it lacks {frame}_scenery_{missing[0]}.")
+    counts = {name: len(stored["occluders" if name.startswith("occluder") else "positions"][0]) for name in names}
+    for name, array in stored.items():
+        is_flag, is_number = name.endswith("mask"), name == "sizes"
+        shape = (1, counts[name]) if is_flag or is_number else (1, counts[name], 3)
+        if array.dtype.kind != ("b" if is_flag else "f") or array.shape != shape or array.size > 100 * MAX_POINTS:
+            raise EditError(f"{path}: {frame}_scenery_{name} is {array.dtype} of shape {array.shape}.")
+        if not is_flag and not np.isfinite(array).all():
+            raise EditError(f"{path}: {frame}_scenery_{name} holds NaN or infinity.")
+    return Scenery(**{name: torch.from_numpy(array) for name, array in stored.items()})
 
 
 def read_points(path: str | Path) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3"]]:

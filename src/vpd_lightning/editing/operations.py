@@ -11,6 +11,7 @@ from torch import Tensor
 
 from vpd_lightning.editing.point_particles import particles_of_points
 from vpd_lightning.editing.rotation import NO_ROTATION, Numbers, Quaternion, matrix_of, quaternion_of, vector_of
+from vpd_lightning.editing.scenery import without_scenery
 from vpd_lightning.editing.selectors import Everything, Selector
 from vpd_lightning.editing.state import EditState, chosen_slots, joined, start_state, transformed
 from vpd_lightning.errors import EditError
@@ -56,7 +57,7 @@ class Delete(Operation):
     def apply(self, state: EditState) -> EditState:
         now, before = find(state, self.select)
         previous, current = state.scene.previous, state.scene.current
-        scene = Scene(replace(previous, mask=previous.mask & ~before), replace(current, mask=current.mask & ~now))
+        scene = Scene(_without(previous, before), _without(current, now))
         return replace(state, scene=scene)
 
 
@@ -217,9 +218,13 @@ class SetVelocity(Operation):
         current = state.scene.current
         moved = transformed(current, now, back, 1.0, _centroid(current, now), shift)
         previous = state.scene.previous
-        kept = replace(previous, mask=previous.mask & ~before)
+        kept = _without(previous, before)
         origin = torch.cat([state.origin, now.nonzero().flatten()])
         return replace(state, scene=Scene(joined(kept, chosen_slots(moved, now)), current), origin=origin)
+
+
+def _without(particles: Particles, chosen: Bool[Tensor, " particle"]) -> Particles:
+    return replace(particles, mask=particles.mask & ~chosen, scenery=without_scenery(particles, chosen))
 
 
 def _with(state: EditState, more: EditState) -> EditState:

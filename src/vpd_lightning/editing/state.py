@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from vpd_lightning.editing.clusters import object_clusters
 from vpd_lightning.editing.matching import match_frames
+from vpd_lightning.editing.scenery import joined_scenery, transformed_scenery, without_scenery
 from vpd_lightning.errors import EditError
 from vpd_lightning.simulator import Scene
 from vpd_lightning.types import Particles
@@ -68,8 +70,8 @@ def start_state(
 
 def chosen_slots(particles: Particles, chosen: Bool[Tensor, " particle"]) -> Particles:
     """Return only the chosen slots of a frame (batch axis of 1)."""
-    values = {item.name: getattr(particles, item.name) for item in fields(particles)}
-    return Particles(**{name: None if value is None else value[:, chosen] for name, value in values.items()})
+    kept = particles.mapped(lambda values: values[:, chosen])
+    return replace(kept, scenery=without_scenery(particles, ~chosen))
 
 
 def joined(first: Particles, second: Particles) -> Particles:
@@ -83,8 +85,10 @@ def joined(first: Particles, second: Particles) -> Particles:
             f"Particles with {second.features.shape[-1]} features cannot join particles with "
             f"{first.features.shape[-1]}.\nEncode both scenes with the same model."
         )
-    parts = {}
+    parts: dict[str, Any] = {"scenery": joined_scenery(first.scenery, second.scenery)}
     for item in fields(first):
+        if item.name == "scenery":
+            continue
         one, other = getattr(first, item.name), getattr(second, item.name)
         if (one is None) != (other is None):
             raise EditError(f"Only one of the two scenes has {item.name}.\nEncode both with the same model.")
@@ -113,4 +117,5 @@ def transformed(
     if particles.normals is not None:
         turned = (particles.normals.double() @ rotation.T).to(particles.normals)
         changed["normals"] = torch.where(where, turned, particles.normals)
-    return replace(particles, **changed)  # type: ignore[arg-type]
+    scenery = transformed_scenery(particles, chosen, rotation, scale, about, translation)
+    return replace(particles, scenery=scenery, **changed)  # type: ignore[arg-type]

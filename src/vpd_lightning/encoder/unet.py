@@ -36,6 +36,7 @@ class UNetEncoder(UnprojectingEncoder):
         use_normals: bool,
         color_features: bool,
         same_pixels: bool,
+        has_scenery: bool,
     ):
         super().__init__(
             network=UNetNetwork(channels=channels, in_channels=3),
@@ -48,6 +49,7 @@ class UNetEncoder(UnprojectingEncoder):
             use_normals=use_normals,
             color_features=color_features,
             same_pixels=same_pixels,
+            has_scenery=has_scenery,
         )
 
     def pixel_features(self, rgb: Float[Tensor, "*shape height width 3"]) -> Tensor:

@@ -52,6 +52,7 @@ class DepthPredictingEncoder(UnprojectingEncoder):
             use_normals=False,
             color_features=False,
             same_pixels=False,
+            has_scenery=False,
         )
         last = network.up[-1]
         assert isinstance(last, nn.Conv2d) and last.bias is not None

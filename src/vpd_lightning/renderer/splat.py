@@ -1,9 +1,10 @@
 """One network evaluation per ray: two depth layers of nearby particles, composited over a learned background."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from vpd_lightning.geometry.decay import decay
@@ -11,7 +12,11 @@ from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
+from vpd_lightning.renderer.scenery_layer import SceneryLayer, SeenScenery
+from vpd_lightning.renderer.shadows import Shadows
 from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
+
+_NUM_OCCLUDERS = 128
 
 _DARKEST = 0.01
 """Colours nearer to 0 or 1 have no logit to add to."""
@@ -28,8 +33,15 @@ class SplatRenderer(AbstractRenderer):
     layer differs from their mean under the first kernel. A ray with no particle in front of its camera shows the
     background alone.
 
+    With ``num_scenery_candidates`` and particles that have scenery, the ray shows that behind the moving particles (see
+    ``SceneryLayer``) instead of the background, in the shadows of what moves from ``num_lights`` lights
+    (``Shadows``): its colours are those observed, times the light that reaches them now over the light then. What is
+    deleted or moved takes its shadow along. ``facing_softness`` (a cosine) fades particles whose normals face away from
+    the camera, so that the far side of a body does not shine through; null leaves them.
+
     ``surface_scale`` is in metres: about as far as a surface reaches beside and behind a particle on it.
-    ``kernel_scales`` (widths beside the ray) and ``layer_depth`` (along it) are multiples of it.
+    ``kernel_scales`` (widths beside the ray), ``layer_depth`` (along it) and ``shadow_softness`` (before training) are
+    multiples of it.
     """
 
     # Paper: renders by volume integration of a radiance field (renderer/point_nerf.py); this one is ours.
@@ -50,6 +62,10 @@ class SplatRenderer(AbstractRenderer):
         far: float,
         ray_chunk_size: int,
         candidate_backend: str,
+        facing_softness: float | None,
+        num_scenery_candidates: int | None,
+        num_lights: int,
+        shadow_softness: float,
     ):
         super().__init__()
         check_backend(candidate_backend)
@@ -64,6 +80,15 @@ class SplatRenderer(AbstractRenderer):
             raise ValueError(
                 f"num_candidates and ray_chunk_size must be at least 1, got {num_candidates}, {ray_chunk_size}"
             )
+        if facing_softness is not None and facing_softness <= 0:
+            raise ValueError(f"facing_softness must be positive or null, got {facing_softness}")
+        if num_lights < 0 or (num_scenery_candidates is not None and num_scenery_candidates < 1):
+            raise ValueError(
+                "num_lights must be at least 0 and num_scenery_candidates at least 1 or null, got "
+                f"{num_lights} and {num_scenery_candidates}"
+            )
+        if num_lights and num_scenery_candidates is None:
+            raise ValueError("num_lights cast shadows on the scenery: set num_scenery_candidates, or num_lights=0")
         if not 0 <= near < far:
             raise ValueError(f"near must lie in [0, far), got near={near}, far={far}")
         self.num_candidates, self.near, self.far = num_candidates, near, far
@@ -89,8 +114,23 @@ class SplatRenderer(AbstractRenderer):
             nn.Linear(3 + 6 * background_frequencies, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, 3)
         )
 
+        self.facing_softness = facing_softness
+        self.scenery: SceneryLayer | None = None
+        self.shadows: Shadows | None = None
+        if num_scenery_candidates is not None:
+            self.scenery = SceneryLayer(num_candidates=num_scenery_candidates, near=near, backend=candidate_backend)
+            if num_lights:
+                self.shadows = Shadows(num_lights=num_lights, softness=surface_scale * shadow_softness)
+
     def forward(self, particles: Particles, rays: Rays, keys: RandomKeys | None) -> RenderedRays:
-        """Render rays (``batch ray 3``); nothing here is random, so ``keys`` is not used."""
+        """Render rays (``batch ray 3``); nothing here is random, so ``keys`` is not used.
+
+        The scenery of the particles may have a shorter batch axis, which divides theirs: each of its members is then
+        that of as many successive ones of theirs, as with the time steps of a clip.
+        """
+        seen = self._seen_scenery(particles, rays)
+        if seen is not None and particles.moving is not None:
+            particles = replace(particles, mask=particles.mask & particles.moving)
         particles = particles.without_padding()
         require_finite(
             "Rendering",
@@ -105,17 +145,24 @@ class SplatRenderer(AbstractRenderer):
                 positions=pad(particles.positions, (0, 0, 0, 1)),
                 features=pad(particles.features, (0, 0, 0, 1)),
                 mask=pad(particles.mask, (0, 1)),
-            )
+            )  # without normals: there is nothing to face
         index = self._candidates(particles, rays.origins, rays.directions)
         slices = [slice(s, s + self.ray_chunk_size) for s in range(0, max(num_rays, 1), self.ray_chunk_size)]
         chunks = [
-            self._render(particles, index[:, some], rays.origins[:, some], rays.directions[:, some]) for some in slices
+            self._render(
+                particles,
+                index[:, some],
+                rays.origins[:, some],
+                rays.directions[:, some],
+                None if seen is None else SeenScenery(*(part[:, some] for part in seen)),
+            )
+            for some in slices
         ]
         rgbs, depths, opacities = (torch.cat(parts, dim=1) for parts in zip(*chunks, strict=True))
         return RenderedRays(rgbs, depths, opacities)
 
     def _render(
-        self, particles: Particles, index: Tensor, origins: Tensor, directions: Tensor
+        self, particles: Particles, index: Tensor, origins: Tensor, directions: Tensor, seen: SeenScenery | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         device_type = origins.device.type
         with torch.autocast(device_type, enabled=False):
@@ -129,11 +176,41 @@ class SplatRenderer(AbstractRenderer):
         alphas = torch.sigmoid(outputs[..., 6:] + 1.0)
         background = torch.sigmoid(self.background(self._encoded(directions)).to(origins.dtype))
         alphas = alphas * sees_any
+        far, opacity = self.far, 0.0
+        if seen is not None:
+            # Scenery in front hides a layer; a body that stands on it is as far away as it is.
+            opacity, far = seen.opacities[..., None], seen.distances[..., None]
+            behind = torch.sigmoid((depth - far) / (0.1 * self.layer_depth) - 5.0)
+            alphas = alphas * (1 - opacity * behind)
+            background = opacity * seen.colors + (1 - opacity) * background
+            far = opacity * far + (1 - opacity) * self.far
         front, back = alphas[..., :1], (1 - alphas[..., :1]) * alphas[..., 1:]
         left = 1 - front - back
         rgbs = front * colors[..., 0, :] + back * colors[..., 1, :] + left * background
-        depths = (front * depth[..., :1] + back * depth[..., 1:] + left * self.far).squeeze(-1)
-        return rgbs, depths, (front + back).squeeze(-1)
+        depths = (front * depth[..., :1] + back * depth[..., 1:] + left * far).squeeze(-1)
+        return rgbs, depths, (front + back + left * opacity).squeeze(-1)
+
+    def _seen_scenery(self, particles: Particles, rays: Rays) -> SeenScenery | None:
+        """Return the scenery along the rays in the shadows of the particles that move now."""
+        scenery = particles.scenery
+        if self.scenery is None or scenery is None:
+            return None
+        repeats = len(rays.origins) // max(len(scenery.positions), 1)
+
+        def per_clip(tensor: Tensor) -> Tensor:
+            return tensor.unflatten(0, (-1, repeats)).flatten(1, 2)
+
+        with torch.autocast(rays.origins.device.type, enabled=False):
+            clip_rays = Rays(per_clip(rays.origins), per_clip(rays.directions))
+            seen = self.scenery(scenery, clip_rays)
+            colors = seen.colors
+            if self.shadows is not None:
+                points = clip_rays.origins + seen.distances[..., None] * clip_rays.directions
+                first = self.shadows(points, scenery.occluders, scenery.occluder_mask)
+                now = self.shadows(points.unflatten(1, (repeats, -1)).flatten(0, 1), *occluders_of(particles))
+                colors = colors * per_clip(now) / first
+            parts = (colors, seen.distances, seen.opacities)
+            return SeenScenery(*(part.unflatten(1, (repeats, -1)).flatten(0, 1) for part in parts))
 
     def _encoded(self, directions: Tensor) -> Float[Tensor, "batch ray channel"]:
         octaves = [directions * (torch.pi * 2**octave) for octave in range(self.background_frequencies)]
@@ -157,6 +234,12 @@ class SplatRenderer(AbstractRenderer):
         front = self._front(along, square, usable)
         in_front = (front + self.layer_depth - along) / (0.3 * self.layer_depth)
         memberships = nn.functional.logsigmoid(torch.stack([in_front, -in_front], dim=2)).clamp(min=-30.0)
+        if self.facing_softness is not None and particles.normals is not None:
+            # A face that is turned away is not seen through the body; what has no normal may face anywhere.
+            facing = (gather(particles.normals) * directions[:, :, None]).sum(dim=-1)
+            hidden = nn.functional.logsigmoid(-facing / self.facing_softness).clamp(min=-30.0)
+            known = gather(particles.normals).square().sum(dim=-1) > 0.5
+            memberships = memberships + torch.where(known, hidden, 0.0)[:, :, None]
         # What cannot be used, in particular what is behind the camera, counts for nothing at all.
         memberships = memberships.masked_fill(~usable[:, :, None], -1e30)
         there = usable[:, :, None].to(along.dtype)
@@ -197,3 +280,12 @@ class SplatRenderer(AbstractRenderer):
         search = RaySearch(particles.positions, particles.mask, self.candidate_backend)
         found = search.closest(origins, directions, count, score)
         return torch.where(found.mask, found.index, -1)
+
+
+def occluders_of(particles: Particles) -> tuple[Float[Tensor, "batch occluder 3"], Bool[Tensor, "batch occluder"]]:
+    """Return the first moving particles of each member, packed: they are in random order."""
+    mask = particles.mask if particles.moving is None else particles.mask & particles.moving
+    count = min(_NUM_OCCLUDERS, int(mask.sum(dim=1).max()) if mask.numel() else 0)
+    index = torch.sort((~mask).to(torch.uint8), dim=1, stable=True).indices[:, :count]
+    positions = torch.gather(particles.positions, 1, index[..., None].expand(-1, -1, 3))
+    return positions, torch.gather(mask, 1, index)

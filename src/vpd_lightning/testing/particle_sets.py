@@ -15,13 +15,13 @@ _NUM_PADDING = 3  # slots before the particles, and as many behind them
 
 def mapped(particles: Particles, function: Callable[[Tensor], Tensor]) -> Particles:
     """Apply a function to every tensor of the particles."""
-    changed = {item.name: getattr(particles, item.name) for item in fields(particles)}
-    return Particles(**{name: None if value is None else function(value) for name, value in changed.items()})
+    return particles.mapped(function)
 
 
 def member(particles: Particles, index: int) -> Particles:
     """Return one member of the batch, as a batch of one."""
-    return mapped(particles, lambda values: values[index : index + 1])
+    scenery = None if particles.scenery is None else particles.scenery[index : index + 1]
+    return replace(mapped(particles, lambda values: values[index : index + 1]), scenery=scenery)
 
 
 def reordered(particles: Particles, order: Int[Tensor, " particle"]) -> Particles:
@@ -75,7 +75,8 @@ def padded_inside(particles: Particles) -> Particles:
         values = [getattr(part, name) for part in parts]
         return None if values[0] is None else torch.cat(values, dim=1)
 
-    return _with_padding_masked(Particles(**{item.name: joined(item.name) for item in fields(Particles)}))
+    names = [item.name for item in fields(Particles) if item.name != "scenery"]
+    return _with_padding_masked(Particles(**{name: joined(name) for name in names}, scenery=particles.scenery))
 
 
 PADDINGS = {"far away": padded_far, "among the particles": padded_inside}

@@ -189,7 +189,11 @@ class InertialDynamics(AbstractDynamics):
             static_index=static_index,
             static_mask=static_mask,
             static_features=static_features,
-            static_shade=self.static_shading(static_features, static_positions, seen.positions, mask),
+            static_shade=(
+                self.static_shading(static_features, static_positions, seen.positions, mask)
+                if current.scenery is None
+                else torch.zeros_like(static_features)
+            ),
         )
 
     def _may_be_hidden(
@@ -336,6 +340,8 @@ class InertialDynamics(AbstractDynamics):
         """Features are the observed ones plus what turned and what moved since; nothing accumulates."""
         moving, static = memory.first_features, memory.static_features
         moving = moving + (self.moving_shading(moving, turned) - memory.first_shade)
+        if current.scenery is not None:  # which the renderer draws, with its shadows
+            return put(current.features, memory.index, moving, memory.mask)
         shade = self.static_shading(static, static_positions, following, memory.mask)
         static = static + (shade - memory.static_shade)
         features = put(current.features, memory.index, moving, memory.mask)

@@ -1,6 +1,6 @@
 """The bodies of the first frame and how each came there: what may move, gathered, divided and matched."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -126,6 +126,4 @@ def _with_a_slot(particles: Particles) -> Particles:
     """Return the particles with one slot of padding where they have no slots at all."""
     if particles.num_particles > 0:
         return particles
-    slots = {item.name: getattr(particles, item.name) for item in fields(particles)}
-    shapes = {name: (len(value), 1, *value.shape[2:]) for name, value in slots.items() if value is not None}
-    return Particles(**{name: slots[name].new_zeros(shape) for name, shape in shapes.items()})
+    return particles.mapped(lambda values: values.new_zeros(len(values), 1, *values.shape[2:]))

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vpd_lightning.encoder.base import AbstractBackground, AbstractEncoder
+from vpd_lightning.encoder.particles.scenery import scenery_of
 from vpd_lightning.errors import EmptyWorkspaceError
 from vpd_lightning.geometry import workspace
 from vpd_lightning.geometry.cameras import unproject
@@ -16,6 +17,9 @@ from vpd_lightning.geometry.workspace import inside_workspace
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles, RGBDFrames, require_finite
 
+_NUM_OCCLUDERS = 128
+"""Points of what moves that cast shadows; a body of a few hundred pixels is outlined by them."""
+
 
 class UnprojectingEncoder(AbstractEncoder):
     """Base of encoders whose particles are pixels: it chooses and unprojects them. A subclass computes features.
@@ -23,7 +27,8 @@ class UnprojectingEncoder(AbstractEncoder):
     ``num_particles`` are chosen uniformly at random among the pixels inside the workspace. With ``moving_fraction``
     (and a ``background`` model) up to that share of them is chosen among pixels that may be moving. With
     ``color_features`` the first three features are the colours of the pixels, whatever the network predicts. With
-    ``same_pixels`` the particles of both context frames are the same pixels, wherever these lie in the workspace.
+    ``same_pixels`` the particles of both context frames are the same pixels, wherever these lie in the workspace. With
+    ``has_scenery`` every pixel that stands still, in the workspace or not, is a point of the particles' ``scenery``.
     """
 
     # Paper: moving_fraction, background, use_normals, color_features and same_pixels are ours; the paper has none of
@@ -47,6 +52,7 @@ class UnprojectingEncoder(AbstractEncoder):
         use_normals: bool,
         color_features: bool,
         same_pixels: bool,
+        has_scenery: bool,
     ):
         super().__init__()
         if num_particles < 1:
@@ -55,6 +61,8 @@ class UnprojectingEncoder(AbstractEncoder):
             raise ValueError(f"workspace_min {list(workspace_min)} must lie below workspace_max {list(workspace_max)}")
         if moving_fraction is not None and background is None:
             raise ValueError("moving_fraction needs a background model; set encoder.background or moving_fraction=null")
+        if has_scenery and background is None:
+            raise ValueError("has_scenery needs a background model, which tells what stands still")
         if color_features and feature_dim < 3:
             raise ValueError(f"color_features needs a feature_dim of at least 3, got {feature_dim}")
         if moving_fraction is not None and not 0 < moving_fraction < 1:
@@ -68,6 +76,7 @@ class UnprojectingEncoder(AbstractEncoder):
         self.use_normals = use_normals
         self.color_features = color_features
         self.same_pixels = same_pixels
+        self.has_scenery = has_scenery
 
     @staticmethod
     def _colors(frames: RGBDFrames) -> Float[Tensor, "batch view height width 3"]:
@@ -102,13 +111,21 @@ class UnprojectingEncoder(AbstractEncoder):
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
         measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
-        moving = None
+        moving, still = None, measured
         if self.background is not None:
             dynamic_mask = self.background(_cropped(frames, candidates))
             moving, border = (pixels.flatten(1) for pixels in _with_border(dynamic_mask))
-            candidates = candidates & ~border
+            candidates, still = candidates & ~border, measured & ~moving & ~border
         index, valid = self._choose(candidates, moving, keys, purpose)
+        normals = None
+        if self.use_normals or self.has_scenery:
+            normals = depth_normals(frames.depth, frames.cameras).flatten(1, 3)
 
+        scenery = None
+        # That of the current frame is drawn; the frame before it has no other.
+        if self.has_scenery and purpose != "previous" and normals is not None and moving is not None:
+            occluders = self._occluders(points, candidates & moving, keys, purpose)
+            scenery = scenery_of(frames, points, normals, still, *occluders)
         points = torch.where(candidates[..., None], points, torch.zeros_like(points))  # no NaN through padding
 
         def take(values: Tensor) -> Tensor:
@@ -123,8 +140,21 @@ class UnprojectingEncoder(AbstractEncoder):
             mask=valid,
             colors=colors,
             moving=None if moving is None else torch.gather(moving, 1, index) & valid,
-            normals=take(depth_normals(frames.depth, frames.cameras).flatten(1, 3)) if self.use_normals else None,
+            normals=take(normals) if self.use_normals and normals is not None else None,
+            scenery=scenery,
         )
+
+    @staticmethod
+    def _occluders(
+        points: Float[Tensor, "batch point 3"], moving: Bool[Tensor, "batch point"], keys: RandomKeys, purpose: str
+    ) -> tuple[Tensor, Tensor]:
+        drawn = [
+            workspace.choose(allowed, _NUM_OCCLUDERS, generator)
+            for allowed, generator in zip(moving, keys.generators(f"occluders/{purpose}"), strict=True)
+        ]
+        index, mask = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+        taken = torch.gather(points, 1, index[..., None].expand(-1, -1, 3))
+        return torch.where(mask[..., None], taken, 0.0), mask
 
     @torch.no_grad()
     def observe(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> dict[str, Tensor]:

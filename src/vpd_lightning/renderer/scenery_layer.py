@@ -1,0 +1,92 @@
+"""What a ray sees of the scenery: colour, distance and opacity from the points nearest to it, in today's shadows."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from vpd_lightning.geometry.decay import decay
+from vpd_lightning.renderer.kernels.ray_search import RaySearch
+from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
+from vpd_lightning.types import Rays, Scenery
+
+_REACH = 2.0
+"""Pixel widths beside the nearest point up to which a ray still meets its surface."""
+
+_STEEPEST = 4.0
+"""Most widths that a pixel seen at a grazing angle counts along the surface."""
+
+
+class SeenScenery(NamedTuple):
+    """The scenery along rays, as it was observed; distances in metres."""
+
+    colors: Float[Tensor, "batch ray 3"]
+    distances: Float[Tensor, "batch ray"]
+    opacities: Float[Tensor, "batch ray"]
+
+
+class SceneryLayer(nn.Module):
+    """The mean colour of the ``num_candidates`` points nearest to each ray.
+
+    A point counts more the nearer it is to the ray (in widths of the pixel that saw it, times a learned one), the more
+    the ray looks the way in which it was seen (a learned angle: reflections and exposure differ between cameras), and
+    the finer it was seen; not where it faces away, nor behind another surface. The ray meets the tangent planes of the
+    points, so a floor has its exact depth.
+    """
+
+    def __init__(self, *, num_candidates: int, near: float, backend: str):
+        super().__init__()
+        self.num_candidates, self.near, self.backend = num_candidates, near, backend
+        self.log_width = nn.Parameter(torch.tensor(math.log(0.5)))  # of a pixel
+        self.log_angle = nn.Parameter(torch.tensor(math.log(0.2)))  # radians
+
+    def forward(self, scenery: Scenery, rays: Rays) -> SeenScenery:
+        """Look along the rays (``batch ray 3``, the scenery's batch axis)."""
+        index = self._candidates(scenery, rays)
+        batch = torch.arange(len(index), device=index.device)[:, None, None]
+        flat = (batch * scenery.positions.shape[1] + index.clamp(min=0)).flatten()
+
+        def gather(values: Tensor) -> Tensor:
+            return values.flatten(0, 1).index_select(0, flat).unflatten(0, index.shape)
+
+        normals, views, sizes = gather(scenery.normals), gather(scenery.views), gather(scenery.sizes)
+        directions = rays.directions[:, :, None]
+        offsets = gather(scenery.positions) - rays.origins[:, :, None]
+        along = (offsets * directions).sum(dim=-1)
+        beside = (offsets - along[..., None] * directions).square().sum(dim=-1).clamp(min=1e-20).sqrt()
+        usable = (index >= 0) & (along > self.near)
+        facing = (normals * directions).sum(dim=-1)
+        known = normals.square().sum(dim=-1) > 0.5
+        usable = usable & ~(known & (facing > 0))
+        grazing = (normals * views).sum(dim=-1).abs().clamp(min=1 / _STEEPEST)
+        reach = sizes / torch.where(known, grazing, 1.0)
+        # Where the ray meets the point's tangent plane, as far as that is near the point.
+        slope = torch.where(known & (facing < -0.05), facing, -1.0)
+        planes = (offsets * normals).sum(dim=-1) / slope
+        met = torch.where(known & (facing < -0.05), planes, along)
+        met = along + (met - along).clamp(-4 * _STEEPEST * sizes, 4 * _STEEPEST * sizes)
+        first = (met + 2 * (beside - _REACH * reach).clamp(min=0)).masked_fill(~usable, torch.inf).amin(-1, True)
+        depth = 3 * sizes
+        before = nn.functional.logsigmoid((first.clamp(max=1e6) + depth - met) / (0.3 * depth))
+        width = sizes * self.log_width.exp()
+        turn = 2 - 2 * (views * directions).sum(dim=-1)  # about the square of the angle
+        logits = before - 0.5 * (beside / width).square() - 0.5 * turn * (-2 * self.log_angle).exp() - 2 * sizes.log()
+        logits = logits.masked_fill(~usable, -1e30)
+        kernels = decay(logits - logits.detach().amax(dim=-1, keepdim=True)) * usable
+        weights = kernels / kernels.sum(dim=-1, keepdim=True).clamp(min=1e-30)
+        colors = (weights[:, :, None] @ gather(scenery.colors)).squeeze(2)
+        distances = (weights * met).sum(dim=-1)
+        nearest = (beside / reach).masked_fill(~usable, 1e6).amin(dim=-1)
+        return SeenScenery(colors, distances, torch.sigmoid(8 * (_REACH - nearest)))
+
+    @torch.no_grad()
+    def _candidates(self, scenery: Scenery, rays: Rays) -> Int[Tensor, "batch ray candidate"]:
+        """Choose the points closest to each ray, hidden ones last, none behind the camera; -1 for none."""
+        sizes = torch.where(scenery.mask, scenery.sizes, torch.nan).nanmedian()
+        width = float(torch.nan_to_num(sizes, nan=1.0))
+        score = BesideAndBehind(self.near, 1.5 * width, 8 * width)
+        search = RaySearch(scenery.positions, scenery.mask, self.backend)
+        found = search.closest(rays.origins, rays.directions, self.num_candidates, score)
+        return torch.where(found.mask, found.index, -1)
