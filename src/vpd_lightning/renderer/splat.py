@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,7 +15,7 @@ from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.renderer.scenery_layer import SceneryLayer, SeenScenery
 from vpd_lightning.renderer.shadows import Shadows
-from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
+from vpd_lightning.types import Particles, Rays, RenderedRays, Scenery, require_finite
 
 _NUM_OCCLUDERS = 128
 
@@ -117,6 +118,7 @@ class SplatRenderer(AbstractRenderer):
         self.facing_softness = facing_softness
         self.scenery: SceneryLayer | None = None
         self.shadows: Shadows | None = None
+        self._kept: tuple[tuple[Any, ...], tuple[SeenScenery, Tensor, Tensor]] | None = None
         if num_scenery_candidates is not None:
             self.scenery = SceneryLayer(num_candidates=num_scenery_candidates, near=near, backend=candidate_backend)
             if num_lights:
@@ -202,15 +204,34 @@ class SplatRenderer(AbstractRenderer):
 
         with torch.autocast(rays.origins.device.type, enabled=False):
             clip_rays = Rays(per_clip(rays.origins), per_clip(rays.directions))
-            seen = self.scenery(scenery, clip_rays)
+            seen, points, first = self._unlit(scenery, rays, clip_rays)
             colors = seen.colors
             if self.shadows is not None:
-                points = clip_rays.origins + seen.distances[..., None] * clip_rays.directions
-                first = self.shadows(points, scenery.occluders, scenery.occluder_mask)
                 now = self.shadows(points.unflatten(1, (repeats, -1)).flatten(0, 1), *occluders_of(particles))
                 colors = colors * per_clip(now) / first
             parts = (colors, seen.distances, seen.opacities)
             return SeenScenery(*(part.unflatten(1, (repeats, -1)).flatten(0, 1) for part in parts))
+
+    def _unlit(self, scenery: Scenery, rays: Rays, clip_rays: Rays) -> tuple[SeenScenery, Tensor, Tensor]:
+        """Return the scenery along the rays as it was observed, where that is, and the light that fell on it then.
+
+        Without gradients it is kept for the next call: a camera that stands still sees the same at every step.
+        """
+        assert self.scenery is not None
+        weights = [p for part in (self.scenery, self.shadows) if part is not None for p in part.parameters()]
+        key = (scenery, rays.origins, rays.directions, [p._version for p in weights])
+        if self._kept is not None and not torch.is_grad_enabled():
+            kept, found = self._kept
+            if all(one is other for one, other in zip(key[:3], kept[:3], strict=True)) and key[3] == kept[3]:
+                return found
+        seen = self.scenery(scenery, clip_rays)
+        points = clip_rays.origins + seen.distances[..., None] * clip_rays.directions
+        first = torch.ones_like(points)
+        if self.shadows is not None:
+            first = self.shadows(points, scenery.occluders, scenery.occluder_mask)
+        found = seen, points, first
+        self._kept = None if torch.is_grad_enabled() else (key, found)
+        return found
 
     def _encoded(self, directions: Tensor) -> Float[Tensor, "batch ray channel"]:
         octaves = [directions * (torch.pi * 2**octave) for octave in range(self.background_frequencies)]
