@@ -67,7 +67,8 @@ class InertialDynamics(AbstractDynamics):
     bodies, resolves contact with static surfaces and between bodies (``ContactSolver``), and moves the particles. The
     friction, restitution, density and stiffness of a body are inferred from its features (``MaterialNetwork``). A body
     in contact that hardly moves stops (``rest_share`` of ``force_scale``). Particles that are not candidates for motion
-    keep their place exactly. Features change only by shading: a turned surface, a moved shadow.
+    keep their place exactly. Features change only by shading: a turned surface, and with ``shadow_scales`` a moved
+    shadow (without, shadows are left to a renderer that draws scenery).
 
     Neither gravity nor a floor is built in: at initialisation this is free motion, changed by contact and by 0.7 % of
     damping a step alone.
@@ -106,7 +107,7 @@ class InertialDynamics(AbstractDynamics):
         rest_share: float,
         keep_shape: bool,
         carry_memory: bool,
-        shadow_scales: Sequence[float],
+        shadow_scales: Sequence[float] | None,
     ):
         super().__init__()
         for name, value in (("num_bodies", num_bodies), ("num_probes", num_probes)):
@@ -138,7 +139,9 @@ class InertialDynamics(AbstractDynamics):
         )
         self.materials = MaterialNetwork(feature_dim=feature_dim, hidden_dim=hidden_dim, is_soft=is_soft)
         self.moving_shading = MovingShading(feature_dim=feature_dim, hidden_dim=hidden_dim)
-        self.static_shading = StaticShading(feature_dim=feature_dim, hidden_dim=hidden_dim, scales=shadow_scales)
+        self.static_shading = None
+        if shadow_scales is not None:
+            self.static_shading = StaticShading(feature_dim=feature_dim, hidden_dim=hidden_dim, scales=shadow_scales)
 
     def initialize(self, previous: Particles, current: Particles, keys: RandomKeys) -> InertialMemory:
         """Divide what may move into bodies, and estimate their first velocities."""
@@ -190,9 +193,9 @@ class InertialDynamics(AbstractDynamics):
             static_mask=static_mask,
             static_features=static_features,
             static_shade=(
-                self.static_shading(static_features, static_positions, seen.positions, mask)
-                if current.scenery is None
-                else torch.zeros_like(static_features)
+                torch.zeros_like(static_features)
+                if self.static_shading is None
+                else self.static_shading(static_features, static_positions, seen.positions, mask)
             ),
         )
 
@@ -340,7 +343,7 @@ class InertialDynamics(AbstractDynamics):
         """Features are the observed ones plus what turned and what moved since; nothing accumulates."""
         moving, static = memory.first_features, memory.static_features
         moving = moving + (self.moving_shading(moving, turned) - memory.first_shade)
-        if current.scenery is not None:  # which the renderer draws, with its shadows
+        if self.static_shading is None:
             return put(current.features, memory.index, moving, memory.mask)
         shade = self.static_shading(static, static_positions, following, memory.mask)
         static = static + (shade - memory.static_shade)
