@@ -12,7 +12,7 @@ from vpd_lightning.config.explaining import parsed
 from vpd_lightning.errors import ConfigError
 
 # Values that other sections refer to: whoever does not refer to one cannot depend on it.
-_SHARED = ("feature_dim", "color_features", "checkpoint_dynamics")
+_SHARED = ("feature_dim", "color_features", "scenery", "checkpoint_dynamics")
 # Read by the program itself: the views that a trained model is shown, and the scene's name in reports.
 _READ_ANYWHERE = ("scene.name", "scene.input_views")
 # Settings that count beside a certain value of another one only: the other one, and what it has to be.
@@ -28,6 +28,8 @@ _ONLY_WITH: dict[str, tuple[str, Callable[[Any], bool], str]] = {
     "generate.preset": ("generate.scene", bool, "the name of a scene"),
     "generate.seed": ("generate.scene", bool, "the name of a scene"),
     "generate.when_missing": ("generate.scene", bool, "the name of a scene"),
+    "renderer.num_scenery_candidates": ("renderer.has_scenery", bool, "true"),
+    "renderer.shadow_softness": ("renderer.num_lights", bool, "more than 0"),
     "protocol.long_start_frame": ("protocol.num_long_steps", bool, "more than 0"),
 }
 _MOST_NAMED = 4

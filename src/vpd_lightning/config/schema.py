@@ -83,6 +83,7 @@ class TrainConfig:
     seed: int = MISSING
     feature_dim: int = MISSING
     color_features: bool = MISSING
+    scenery: bool = MISSING
     checkpoint_dynamics: bool = MISSING
     float32_matmul_precision: str = MISSING
     deterministic: bool = MISSING

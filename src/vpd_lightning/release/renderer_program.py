@@ -51,8 +51,7 @@ def export_renderer(
     if getattr(renderer, "scenery", None) is not None:
         raise ConfigError(
             "This renderer draws the scenery of a clip, which a program of particles and rays does not have.\n"
-            "Leave renderer_program out, or train with renderer.num_scenery_candidates=null renderer.num_lights=0 "
-            "encoder.has_scenery=false."
+            "Leave renderer_program out, or train with scenery=false."
         )
     renderer = copy.deepcopy(renderer).to("cpu", torch.float32).eval().requires_grad_(False)
     if hasattr(renderer, "candidate_backend"):  # compiled loops of numba cannot go into a program

@@ -34,7 +34,7 @@ class SplatRenderer(AbstractRenderer):
     layer differs from their mean under the first kernel. A ray with no particle in front of its camera shows the
     background alone.
 
-    With ``num_scenery_candidates`` and particles that have scenery, the ray shows that behind the moving particles (see
+    With ``has_scenery`` and particles that have some, the ray shows that behind the moving particles (see
     ``SceneryLayer``) instead of the background, in the shadows of what moves from ``num_lights`` lights
     (``Shadows``): its colours are those observed, times the light that reaches them now over the light then. What is
     deleted or moved takes its shadow along. ``facing_softness`` (a cosine) fades particles whose normals face away from
@@ -64,7 +64,8 @@ class SplatRenderer(AbstractRenderer):
         ray_chunk_size: int,
         candidate_backend: str,
         facing_softness: float | None,
-        num_scenery_candidates: int | None,
+        has_scenery: bool,
+        num_scenery_candidates: int,
         num_lights: int,
         shadow_softness: float,
     ):
@@ -83,13 +84,13 @@ class SplatRenderer(AbstractRenderer):
             )
         if facing_softness is not None and facing_softness <= 0:
             raise ValueError(f"facing_softness must be positive or null, got {facing_softness}")
-        if num_lights < 0 or (num_scenery_candidates is not None and num_scenery_candidates < 1):
+        if num_lights < 0 or num_scenery_candidates < 1:
             raise ValueError(
-                "num_lights must be at least 0 and num_scenery_candidates at least 1 or null, got "
-                f"{num_lights} and {num_scenery_candidates}"
+                f"num_lights must be at least 0 and num_scenery_candidates at least 1, got {num_lights} and "
+                f"{num_scenery_candidates}"
             )
-        if num_lights and num_scenery_candidates is None:
-            raise ValueError("num_lights cast shadows on the scenery: set num_scenery_candidates, or num_lights=0")
+        if num_lights and not has_scenery:
+            raise ValueError(f"num_lights={num_lights} cast shadows on the scenery: set scenery=true, or num_lights=0")
         if not 0 <= near < far:
             raise ValueError(f"near must lie in [0, far), got near={near}, far={far}")
         self.num_candidates, self.near, self.far = num_candidates, near, far
@@ -119,7 +120,7 @@ class SplatRenderer(AbstractRenderer):
         self.scenery: SceneryLayer | None = None
         self.shadows: Shadows | None = None
         self._kept: tuple[tuple[Any, ...], tuple[SeenScenery, Tensor, Tensor]] | None = None
-        if num_scenery_candidates is not None:
+        if has_scenery:
             self.scenery = SceneryLayer(num_candidates=num_scenery_candidates, near=near, backend=candidate_backend)
             if num_lights:
                 self.shadows = Shadows(num_lights=num_lights, softness=surface_scale * shadow_softness)
