@@ -176,7 +176,7 @@ class SplatRenderer(AbstractRenderer):
             means = inputs.unflatten(-1, (2, -1))[..., :3].to(logits.dtype)
             logits = logits + torch.logit(means.clamp(_DARKEST, 1 - _DARKEST))
         colors = torch.sigmoid(logits)
-        alphas = torch.sigmoid(outputs[..., 6:] + 1.0)
+        alphas = torch.sigmoid(outputs[..., 6:] + (1.0 if seen is None else self._coverage(inputs)))
         background = torch.sigmoid(self.background(self._encoded(directions)).to(origins.dtype))
         alphas = alphas * sees_any
         far, opacity = self.far, 0.0
@@ -233,6 +233,15 @@ class SplatRenderer(AbstractRenderer):
         found = seen, points, first
         self._kept = None if torch.is_grad_enabled() else (key, found)
         return found
+
+    def _coverage(self, inputs: Tensor) -> Float[Tensor, "batch ray 2"]:
+        """Return the logit that a layer stops the ray before training: yes within about the middle kernel's width.
+
+        Without scenery a ray beside a body meets other particles; with it, it must pass.
+        """
+        num_scales = len(self.kernel_scales)
+        visible = inputs.unflatten(-1, (2, -1))[..., :-1].unflatten(-1, (num_scales, -1))[..., num_scales // 2, -1]
+        return 3.0 + 20.0 * visible
 
     def _encoded(self, directions: Tensor) -> Float[Tensor, "batch ray channel"]:
         octaves = [directions * (torch.pi * 2**octave) for octave in range(self.background_frequencies)]
