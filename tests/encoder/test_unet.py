@@ -40,6 +40,7 @@ def encoder(**changes):
         "use_normals": False,
         "color_features": False,
         "same_pixels": False,
+        "has_scenery": False,
     }
     return UNetEncoder(**{**arguments, **changes})
 

@@ -37,6 +37,7 @@ def small_simulator() -> Simulator:
         encoder=UNetEncoder(
             channels=[8, 16, FEATURE_DIM], num_particles=256, workspace_min=WORKSPACE_MIN, workspace_max=WORKSPACE_MAX,
             moving_fraction=None, background=None, use_normals=False, color_features=True, same_pixels=True,
+            has_scenery=False,
         ),
         dynamics=HierarchicalGNNDynamics(
             feature_dim=FEATURE_DIM, hidden_dim=64, message_passing_steps=2, num_abstract_nodes=32,
@@ -48,6 +49,7 @@ def small_simulator() -> Simulator:
             feature_dim=FEATURE_DIM, color_features=True, background_frequencies=4, hidden_dim=32, num_layers=2,
             num_candidates=16, surface_scale=0.3, kernel_scales=[0.15, 0.4, 1.0], layer_depth=1.0, near=NEAR, far=FAR,
             ray_chunk_size=2048, candidate_backend="auto",
+            facing_softness=None, has_scenery=False, num_scenery_candidates=12, num_lights=0, shadow_softness=0.5,
         ),
         location_noise=0.0, checkpoint_dynamics=False, pixel_gradient_to_motion=1.0,
     )  # fmt: skip

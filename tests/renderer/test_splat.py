@@ -26,6 +26,11 @@ SETTINGS = {
     "far": 10.0,
     "ray_chunk_size": 7,
     "candidate_backend": "auto",
+    "facing_softness": None,
+    "has_scenery": False,
+    "num_scenery_candidates": 12,
+    "num_lights": 0,
+    "shadow_softness": 0.5,
 }
 BACKENDS = ["torch", pytest.param("numba", marks=pytest.mark.skipif(not find_spec("numba"), reason="needs numba"))]
 

@@ -90,7 +90,7 @@ class Training:
             encoder=UNetEncoder(
                 channels=[16, 32, 64, 32, FEATURE_DIM], num_particles=512, workspace_min=WORKSPACE_MIN,
                 workspace_max=WORKSPACE_MAX, moving_fraction=None, background=None, use_normals=False,
-                color_features=True, same_pixels=row.same_pixels,
+                color_features=True, same_pixels=row.same_pixels, has_scenery=False,
             ),
             dynamics=HierarchicalGNNDynamics(
                 feature_dim=FEATURE_DIM, hidden_dim=128, message_passing_steps=row.message_passing_steps,
@@ -103,7 +103,8 @@ class Training:
             renderer=SplatRenderer(
                 feature_dim=FEATURE_DIM, color_features=True, background_frequencies=4, hidden_dim=96, num_layers=3,
                 num_candidates=24, surface_scale=row.surface_scale, kernel_scales=[0.15, 0.4, 1.0], layer_depth=1.0,
-                near=NEAR, far=FAR, ray_chunk_size=2048, candidate_backend="auto",
+                near=NEAR, far=FAR, ray_chunk_size=2048, candidate_backend="auto", facing_softness=None,
+                has_scenery=False, num_scenery_candidates=12, num_lights=0, shadow_softness=0.5,
             ),
             location_noise=0.0, checkpoint_dynamics=False, pixel_gradient_to_motion=1.0,
         )  # fmt: skip
