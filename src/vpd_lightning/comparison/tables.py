@@ -101,16 +101,16 @@ def winners(table: ComparisonTable) -> list[str]:
 def differences_table(table: ComparisonTable) -> list[str]:
     """Mean differences of pairs on the same clips."""
     lines = []
-    for first, second, found in paired_differences(table):
-        if not found:
-            continue
-        cells = [_difference(info, found[info.name][0]) if info.name in found else "-" for info in paired()]
+    pairs = [pair for pair in paired_differences(table) if pair[2]]
+    infos = [info for info in paired() if any(info.name in found for _, _, found in pairs)]
+    for first, second, found in pairs:
+        cells = [_difference(info, found[info.name][0]) if info.name in found else "-" for info in infos]
         counts = sorted({number for _, number in found.values()})
         second = f"*{TITLES[second]}*" if second in TITLES else second
         lines.append(
             [f"{first} - {second}", *cells, " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))]
         )
-    head = ["first - second", *(info.label for info in paired()), "trajectories"]
+    head = ["first - second", *(info.label for info in infos), "trajectories"]
     return markdown(head, lines) if lines else []
 
 

@@ -197,7 +197,7 @@ def step_table(metrics: Mapping[str, Any]) -> dict[str, list[float | None]]:
     """Collect every per-step curve under a flat name; step 1 is the first predicted frame."""
     columns: dict[str, list[float | None]] = {}
     for system, values in (("model", metrics), *metrics["references"].items()):
-        for info in image_metrics():
+        for info in (info for info in image_metrics() if info.name in values):  # older files have fewer
             columns[f"{system}/{info.name}"] = values[info.name]["per_step"]
     for info in blocks():
         if metrics[info.name]:

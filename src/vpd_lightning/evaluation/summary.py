@@ -18,6 +18,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
         *_seen_lines(metrics),
         "",
         *_image_lines(metrics),
+        *_unmeasured_lines(metrics),
         *_other_lines(metrics),
     ]
     if metrics["motion"]:
@@ -49,7 +50,7 @@ def _other_lines(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _spoken(means: Mapping[str, Any]) -> str:
-    return ", ".join(info.spoken(means[info.name]) for info in still_scores())
+    return ", ".join(info.spoken(means[info.name]) for info in still_scores() if info.name in means)
 
 
 def horizons(num_steps: int) -> list[int]:
@@ -63,11 +64,20 @@ def horizons(num_steps: int) -> list[int]:
 
 
 def _image_lines(metrics: Mapping[str, Any]) -> list[str]:
-    infos = [info for info in image_metrics() if info.in_summary]
+    infos = [info for info in image_metrics() if info.in_summary and info.name in metrics]
     width = _label_width(info.label for info in infos)
     return [
         f"{'':{width}}{'model':>9}{'copy last':>11}{'train mean':>12}{'gain':>8}",
         *(_image_line(info, width, metrics) for info in infos),
+    ]
+
+
+def _unmeasured_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Say why a metric has no value, where a package was missing."""
+    return [
+        f"{info.title} was not measured: the package {info.needs_package} was not installed."
+        for info in image_metrics()
+        if info.needs_package and info.name in metrics and metrics[info.name]["mean"] is None
     ]
 
 

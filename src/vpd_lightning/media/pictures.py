@@ -30,14 +30,15 @@ def write_curves(path: Path, table: Mapping[str, Sequence[float | None]]) -> Non
     ``table`` is that of ``evaluation.report.step_table``; a value that does not exist is None and leaves a gap.
     """
     motion = [info for info in referenced() if f"motion/{info.name}" in table]
-    figure = Figure(figsize=(4.2 * (len(scores()) + len(motion)), 3.4), layout="constrained")
-    axes = figure.subplots(1, len(scores()) + len(motion), squeeze=False)[0]
-    for axis, info in zip(axes, scores(), strict=False):
+    images = [info for info in scores() if any(value is not None for value in table.get(f"model/{info.name}", ()))]
+    figure = Figure(figsize=(4.2 * (len(images) + len(motion)), 3.4), layout="constrained")
+    axes = figure.subplots(1, len(images) + len(motion), squeeze=False)[0]
+    for axis, info in zip(axes, images, strict=False):
         for source, style in _STYLES.items():
             curve = info.scale * _curve(table[f"{source}/{info.name}"])
             axis.plot(table["step"], curve, marker=_marker(table), **style)
         axis.set_title(info.label)
-    for axis, info in zip(axes[len(scores()) :], motion, strict=True):
+    for axis, info in zip(axes[len(images) :], motion, strict=True):
         blind = [other for other in references_of(info) if not other.sees_input]
         labels = {info.name: "model", **{other.name: other.title for other in blind}}
         for (name, label), style in zip(labels.items(), cycle(_MOTION_STYLES), strict=False):

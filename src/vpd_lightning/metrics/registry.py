@@ -30,6 +30,12 @@ METRICS: tuple[MetricInfo, ...] = (
         function="vpd_lightning.metrics.ssim.ssim_of_images", description="structural similarity of every image",
     ),
     MetricInfo(
+        name="flip", title="FLIP", unit="", better="lower", digits=3, subject="image",
+        function="vpd_lightning.metrics.flip.flip_of_images", needs_package="flip-evaluator",
+        description="how different an image looks from the truth when the two alternate (LDR-FLIP), from 0 to 1, at "
+        "67 pixels per degree; measured where the package flip-evaluator is installed",
+    ),
+    MetricInfo(
         name="sharpness", title="sharpness", unit="", better="one", digits=2, subject="image",
         function="vpd_lightning.metrics.sharpness.sharpness_of_images",
         description="mean gradient length of the prediction over that of the truth: below 1 is blurred; where most of "

@@ -87,7 +87,7 @@ def _blind_references(info: MetricInfo, metrics: Mapping[str, Any]) -> dict[Metr
 
 def _image_rows(metrics: Mapping[str, Any], info: MetricInfo) -> list[str]:
     name, digits = info.name, info.digits
-    if not metrics.get(name):
+    if (metrics.get(name) or {}).get("mean") is None:
         return []
     rows = []
     references = [metrics["references"][reference].get(name) or {} for reference in REFERENCES]
