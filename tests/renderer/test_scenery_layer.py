@@ -47,7 +47,7 @@ def random_scene(batch=2, count=30, num_rays=25, seed=0):
     normals = unit(noise(batch, count, 3) - torch.tensor([0.0, 0.0, 1.0])) * (uniform(batch, count, 1) > 0.33)
     views = unit(0.3 * noise(batch, count, 3) + torch.tensor([0.0, 0.0, 1.0]))
     sizes = 0.01 + 0.04 * uniform(batch, count)
-    directions = unit(torch.cat([0.12 * noise(batch, num_rays, 2), torch.ones(batch, num_rays, 1).double()], dim=-1))
+    directions = unit(torch.cat([0.2 * noise(batch, num_rays, 2), torch.ones(batch, num_rays, 1).double()], dim=-1))
     rays = Rays(0.02 * noise(batch, num_rays, 3), directions)
     return scenery(positions, uniform(batch, count, 3), normals, views, sizes, uniform(batch, count) > 0.2), rays
 
@@ -274,7 +274,7 @@ def test_members_of_a_batch_do_not_share_how_fine_their_scenery_is():
     """The search among more points than candidates ranks by a width; each member has its own."""
     fine, rays = random_scene(batch=1, count=200, num_rays=40, seed=3)
     coarse, _ = random_scene(batch=1, count=200, num_rays=40, seed=4)
-    fine = scenery(fine.positions, fine.colors, fine.normals, fine.views, 0.1 * fine.sizes, fine.mask)
+    coarse = scenery(coarse.positions, coarse.colors, coarse.normals, coarse.views, 5 * coarse.sizes, coarse.mask)
     both = Scenery(**{name: torch.cat([getattr(fine, name), getattr(coarse, name)]) for name in vars(fine)})
     twice = Rays(rays.origins.expand(2, -1, -1), rays.directions.expand(2, -1, -1))
 
