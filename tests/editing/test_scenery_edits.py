@@ -38,9 +38,14 @@ def scenery(count=300, seed=0):
 
 
 def scene_with_scenery(seed=0):
-    """Return two boxes with scenery in the current frame, as an encoder gives it, and whose each particle is."""
+    """Return two boxes just above a floor, with scenery in the current frame, and the body of each particle there."""
     scene, _, now = two_boxes(seed)
-    return Scene(scene.previous, replace(scene.current, scenery=scenery(seed=seed))), now
+
+    def lowered(frame):
+        drop = 0.49 * frame.moving[..., None] * torch.tensor([0.0, 0.0, 1.0])
+        return replace(frame, positions=frame.positions - drop)
+
+    return Scene(lowered(scene.previous), replace(lowered(scene.current), scenery=scenery(seed=seed))), now
 
 
 def nearest_of(particles, points):
