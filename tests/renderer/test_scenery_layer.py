@@ -236,8 +236,8 @@ def test_junk_in_padding_changes_nothing(num_candidates):
     parts = {name: getattr(scene, name) for name in ("positions", "colors", "normals", "views", "sizes")}
     junk = {name: torch.where(scene.mask.view(*scene.mask.shape, *[1] * (v.ndim - 2)), v, -7.0) for name, v in
             parts.items()}  # fmt: skip
-    wide = {name: torch.cat([torch.full_like(v[:, :5], 40.0), v], dim=1) for name, v in junk.items()}
-    padded = scenery(**wide, mask=torch.cat([torch.zeros(2, 5, dtype=torch.bool), scene.mask], dim=1))
+    wide = {name: torch.cat([torch.full_like(v, 40.0), torch.full_like(v, 40.0), v], dim=1) for name, v in junk.items()}
+    padded = scenery(**wide, mask=torch.cat([torch.zeros(2, 60, dtype=torch.bool), scene.mask], dim=1))
 
     for one, other in zip(model(scene, rays), model(padded, rays), strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-12)
