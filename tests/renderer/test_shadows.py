@@ -8,12 +8,12 @@ from vpd_lightning.renderer.shadows import Shadows
 
 
 def shadows(num_lights=3, softness=0.1, share=0.2, seed=0):
-    """Lights in random upper directions, with random shares and widths."""
+    """Lights in random upper directions, with random shares (some below zero) and widths."""
     generator = torch.Generator().manual_seed(seed)
     model = Shadows(num_lights=num_lights, softness=softness).double()
     with torch.no_grad():
         model.directions += 0.3 * torch.randn(num_lights, 3, generator=generator)
-        model.shares.copy_(share * torch.rand(num_lights, 3, generator=generator))
+        model.shares.copy_(share * (1.3 * torch.rand(num_lights, 3, generator=generator) - 0.3))
         model.log_softness += 0.3 * torch.randn(num_lights, generator=generator)
     return model
 
