@@ -17,6 +17,7 @@ def renderer(**changes):
     return plain_renderer(
         **{
             "facing_softness": None,
+            "has_scenery": True,
             "num_scenery_candidates": 12,
             "num_lights": 1,
             "shadow_softness": 0.5,
@@ -85,7 +86,7 @@ def with_side_light(model):
 
 
 def floor_only(model):
-    """Make layers of particles transparent: before training, a body covers also the rays that pass far beside it."""
+    """Make layers of particles transparent, so that the floor alone is seen, with its shadows."""
     with torch.no_grad():
         model.network[-1].weight[6:], model.network[-1].bias[6:] = 0, -40
     return model
@@ -122,7 +123,7 @@ def test_a_shadow_moves_with_its_body():
 
 
 def test_scenery_is_ignored_where_it_is_not_asked_for():
-    model, rays, body = renderer(num_scenery_candidates=None, num_lights=0), straight_down(BESIDE), ball(BALL)
+    model, rays, body = renderer(has_scenery=False, num_lights=0), straight_down(BESIDE), ball(BALL)
     scene = joined(body, replace(ball([0.4, 0.0, 0.0], GREEN), moving=torch.zeros(1, 40, dtype=torch.bool)))
 
     with_it, without = model(replace(scene, scenery=floor()), rays, None), model(scene, rays, None)
@@ -271,6 +272,47 @@ def test_a_body_that_was_added_last_casts_a_shadow_as_well():
     assert (model(last, rays, None).rgbs[0, 0] < 0.95 * tensor(GRAY)).all()
 
 
+def test_what_is_kept_between_steps_does_not_outlive_its_scene_or_weights():
+    """Without gradients the scenery along the same rays is kept for the next step."""
+    model, body, rays = floor_only(with_side_light(renderer())), ball(BALL), straight_down(BESIDE)
+    scene = replace(body, scenery=floor(occluders=body.positions))
+    gone = replace(scene, mask=scene.mask & False)
+    other, elsewhere = replace(scene, scenery=floor(0.2, GREEN)), straight_down([[0.1, 0.2], [0.5, 0.5]])
+
+    with torch.no_grad():
+        steps = [(scene, rays), (gone, rays), (other, rays), (scene, elsewhere), (scene, rays)]
+        kept = [model(some, lines, None) for some, lines in steps]
+        model.shadows.shares.mul_(0.5)
+        dimmer = model(gone, rays, None)
+
+    model.shadows.shares.detach().mul_(2.0)
+    for (some, lines), out in zip(steps, kept, strict=True):  # with gradients nothing is kept
+        for name in ("rgbs", "depths", "opacities"):
+            torch.testing.assert_close(getattr(out, name), getattr(model(some, lines, None), name).detach())
+    assert (kept[1].rgbs - dimmer.rgbs)[0, 0].abs().max() > 0.01
+
+
+def test_rays_that_were_overwritten_in_place_are_looked_along_anew():
+    model, body, rays = renderer(), ball(BALL), straight_down(BESIDE)
+    scene = replace(body, scenery=floor())
+
+    with torch.no_grad():
+        model(scene, rays, None)
+        rays.origins[..., 0] += 5.0  # past the edge of the floor
+        out = model(scene, rays, None)
+
+    assert out.opacities.max() < 0.01
+
+
+def test_before_training_a_ray_passes_beside_a_body_and_not_through_it():
+    model, rays = renderer(num_lights=0), straight_down([[0.0, 0.0], *BESIDE])
+
+    rgbs = model(replace(ball(BALL, count=200), scenery=floor()), rays, None).rgbs[0]
+
+    assert (rgbs[0] - tensor(RED)).abs().max() < 0.1
+    assert (rgbs[1:] - tensor(GRAY)).abs().max() < 1e-3
+
+
 def test_no_rays_and_no_particles_are_no_error():
     model, body = renderer(), replace(ball(BALL), scenery=floor())
     rays = straight_down(BESIDE)
@@ -313,8 +355,8 @@ def test_gradients_reach_shadows_scenery_and_what_moves_and_are_finite():
         ({"facing_softness": 0.0}, "facing_softness must be positive or null"),
         ({"facing_softness": -1.0}, "facing_softness must be positive or null"),
         ({"num_lights": -1}, "num_lights must be at least 0"),
-        ({"num_scenery_candidates": 0}, "num_scenery_candidates at least 1 or null"),
-        ({"num_scenery_candidates": None}, "num_lights cast shadows on the scenery"),
+        ({"num_scenery_candidates": 0}, "num_scenery_candidates at least 1"),
+        ({"has_scenery": False}, "num_lights=1 cast shadows on the scenery"),
         ({"shadow_softness": 0.0}, "softness positive"),
     ],
 )
@@ -324,7 +366,7 @@ def test_wrong_settings_are_refused_by_name(changes, words):
 
 
 def test_parts_that_are_not_asked_for_hold_no_weights():
-    without, unlit = renderer(num_scenery_candidates=None, num_lights=0), renderer(num_lights=0)
+    without, unlit = renderer(has_scenery=False, num_lights=0), renderer(num_lights=0)
 
     assert without.scenery is None and without.shadows is None and unlit.shadows is None
     assert isinstance(renderer().shadows, Shadows) and isinstance(unlit, SplatRenderer)
