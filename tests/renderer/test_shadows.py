@@ -1,0 +1,214 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from vpd_lightning.renderer.shadows import Shadows
+
+
+def shadows(num_lights=3, softness=0.1, share=0.2, seed=0):
+    """Lights in random upper directions, with random shares (some below zero) and widths."""
+    generator = torch.Generator().manual_seed(seed)
+    model = Shadows(num_lights=num_lights, softness=softness).double()
+    with torch.no_grad():
+        model.directions += 0.3 * torch.randn(num_lights, 3, generator=generator)
+        model.shares.copy_(share * (1.3 * torch.rand(num_lights, 3, generator=generator) - 0.3))
+        model.log_softness += 0.3 * torch.randn(num_lights, generator=generator)
+    return model
+
+
+def scene(batch=2, num_points=9, num_occluders=7, seed=0):
+    """Points on the floor and occluders up to half a metre above it, a third of them padding with junk."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(batch, num_points, 3, generator=generator).double() * torch.tensor([1.0, 1.0, 0.05])
+    occluders = torch.rand(batch, num_occluders, 3, generator=generator).double() * torch.tensor([1.0, 1.0, 0.5])
+    mask = torch.rand(batch, num_occluders, generator=generator) > 0.33
+    return points, torch.where(mask[..., None], occluders, 30.0), mask
+
+
+def plain(model, points, occluders, mask):
+    """Every light, point and occluder in turn, by the words of the class. NumPy, float64."""
+    directions = model.directions.detach().numpy()
+    shares, widths = model.shares.detach().numpy(), model.log_softness.detach().exp().numpy()
+    light = np.ones(points.shape)
+    for member in range(len(points)):
+        for i, point in enumerate(points[member].numpy()):
+            for direction, share, width in zip(directions, shares, widths, strict=True):
+                direction = direction / np.linalg.norm(direction)
+                blocked = 0.0
+                for occluder, there in zip(occluders[member].numpy(), mask[member].numpy(), strict=True):
+                    if there:
+                        towards = float((occluder - point) @ direction)
+                        beside = float(np.linalg.norm(np.cross(occluder - point, direction)))
+                        ahead = 1 / (1 + math.exp(2 - towards / (0.5 * width)))
+                        blocked += math.exp(-(beside**2) / (2 * width**2)) * ahead
+                light[member, i] -= np.maximum(share, 0) * (1 - math.exp(-blocked))
+    return torch.from_numpy(np.maximum(light, 0.05))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_light_is_what_plain_loops_give(seed):
+    model, (points, occluders, mask) = shadows(seed=seed, share=0.6), scene(seed=seed)
+
+    light, expected = model(points, occluders, mask), plain(model, points, occluders, mask)
+
+    torch.testing.assert_close(light, expected, rtol=0, atol=1e-9)
+    assert expected.min() < 0.7
+
+
+def test_a_point_above_all_else_has_all_the_light():
+    model, (points, occluders, _) = shadows(), scene()
+
+    none = model(points, occluders[:, :0], torch.zeros(2, 0, dtype=torch.bool))
+    masked = model(points, occluders, torch.zeros(2, 7, dtype=torch.bool))
+
+    assert torch.equal(none, torch.ones_like(points)) and torch.equal(masked, torch.ones_like(points))
+
+
+def test_masked_occluders_cast_nothing():
+    model, (points, occluders, mask) = shadows(), scene()
+    junk = torch.where(mask[..., None], occluders, points.mean(dim=1, keepdim=True) + torch.tensor([0.0, 0.0, 0.3]))
+
+    torch.testing.assert_close(model(points, junk, mask), model(points, occluders, mask), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("height", "lit"), [(0.5, False), (0.2, False), (-0.2, True), (-0.5, True)])
+def test_only_what_is_above_a_point_casts_on_it(height, lit):
+    model = Shadows(num_lights=1, softness=0.05).double()  # straight up
+    point, occluders = torch.zeros(1, 1, 3).double(), torch.tensor([0.0, 0.0, height]).double().expand(1, 20, 3)
+
+    light = model(point, occluders, torch.ones(1, 20, dtype=torch.bool))
+
+    torch.testing.assert_close(light, torch.full_like(point, 1.0 if lit else 0.9), rtol=0, atol=1e-3)
+
+
+def test_a_shadow_falls_on_the_side_away_from_the_light():
+    model = Shadows(num_lights=1, softness=0.03).double()
+    with torch.no_grad():
+        model.directions.copy_(torch.tensor([[1.0, 0.0, 1.0]]))  # the light stands at the side of positive x
+    points = torch.tensor([[[-0.4, 0.0, 0.0], [0.4, 0.0, 0.0], [0.0, 0.0, 0.0], [-0.4, 0.3, 0.0]]]).double()
+    occluders = torch.tensor([0.0, 0.0, 0.4]).double().expand(1, 9, 3)
+
+    light = model(points, occluders, torch.ones(1, 9, dtype=torch.bool))[0, :, 0]
+
+    assert light[0] < 0.901 and (light[1:] > 0.999).all()
+
+
+def test_shifting_everything_far_away_changes_nothing():
+    model, (points, occluders, mask) = shadows().float(), scene()
+    points, occluders = points.float(), occluders.float()
+    shift = torch.tensor([200.0, -300.0, 100.0])
+
+    light, shifted = model(points, occluders, mask), model(points + shift, occluders + shift, mask)
+
+    # A place 300 m away is known to 3e-5 m in float32, against widths of 0.1 m.
+    assert (light - shifted).abs().max() < 2e-3
+    assert (light - model(points + shift, occluders, mask)).abs().max() > 0.05
+
+
+def test_members_do_not_cast_on_each_other():
+    model, (points, occluders, mask) = shadows(), scene()
+
+    together = model(points, occluders, mask)
+
+    for i in range(2):
+        alone = model(points[i : i + 1], occluders[i : i + 1], mask[i : i + 1])
+        torch.testing.assert_close(together[i : i + 1], alone, rtol=0, atol=1e-12)
+
+
+def test_lights_without_a_share_do_nothing():
+    model, (points, occluders, mask) = shadows(), scene()
+    with torch.no_grad():
+        model.shares[1] = torch.tensor([-0.3, 0.0, -0.1])
+    fewer = Shadows(num_lights=2, softness=0.1).double()
+    with torch.no_grad():
+        for name in ("directions", "shares", "log_softness"):
+            getattr(fewer, name).copy_(getattr(model, name)[[0, 2]])
+
+    torch.testing.assert_close(
+        model(points, occluders, mask), fewer(points, occluders, mask), rtol=0, atol=1e-12
+    )  # fmt: skip
+    with torch.no_grad():
+        model.shares.fill_(-1.0)
+    assert torch.equal(model(points, occluders, mask), torch.ones_like(points))
+
+
+def test_light_never_runs_out():
+    model, (points, _, _) = shadows(share=5.0), scene()
+
+    light = model(points, (points + torch.tensor([0.0, 0.0, 0.5])).repeat(1, 9, 1), torch.ones(2, 81, dtype=torch.bool))
+
+    assert light.min().item() == pytest.approx(0.05)
+
+
+def test_gradients_match_finite_differences():
+    model, (points, occluders, mask) = shadows(num_lights=2, share=0.3), scene(batch=1, num_points=4, num_occluders=5)
+    names = [name for name, _ in model.named_parameters()]
+
+    def light(points, occluders, *weights):
+        return torch.func.functional_call(model, dict(zip(names, weights, strict=True)), (points, occluders, mask))
+
+    weights = [parameter.detach().clone().requires_grad_() for parameter in model.parameters()]
+    inputs = (points.requires_grad_(), torch.where(mask[..., None], occluders, 1.0).requires_grad_(), *weights)
+    assert torch.autograd.gradcheck(light, inputs, eps=1e-6, atol=1e-6)
+
+
+def disc(center, radius=0.1, count=40):
+    """Points spread over a level disc."""
+    steps = torch.arange(count).double()
+    angle, distance = 2.399963 * steps, radius * ((steps + 0.5) / count).sqrt()
+    flat = torch.stack([distance * angle.cos(), distance * angle.sin(), torch.zeros_like(steps)], dim=-1)
+    return flat + torch.tensor(center, dtype=torch.float64)
+
+
+def cast(points, centers, direction, radius=0.1, width=0.02):
+    """How much light a disc leaves: the line from a point to the light crosses the disc's height inside of it."""
+    height = centers[:, None, 2:] / direction[2]
+    crossing = points + height * direction
+    gap = (crossing - centers[:, None])[..., :2].norm(dim=-1, keepdim=True) - radius
+    return 1 - torch.tensor([0.3, 0.25, 0.2]).double() * torch.sigmoid(-gap / width)
+
+
+@pytest.mark.parametrize("num_lights", [1, 4])
+def test_the_direction_of_the_light_is_learned_from_shadows(num_lights):
+    direction = torch.tensor([math.sin(math.radians(30)), 0.0, math.cos(math.radians(30))]).double()
+    generator = torch.Generator().manual_seed(0)
+    centers = torch.tensor([[0.0, 0.0, 0.2], [0.2, 0.1, 0.35], [-0.1, 0.2, 0.5]]).double()
+    occluders = torch.stack([disc(center.tolist()) for center in centers])
+    floor = (1.6 * torch.rand(3, 150, 3, generator=generator).double() - 0.8) * torch.tensor([1.0, 1.0, 0.0])
+    target, mask = cast(floor, centers, direction), torch.ones(3, 40, dtype=torch.bool)
+    model = Shadows(num_lights=num_lights, softness=0.1).double()
+    # A share starts at 0.1 / num_lights: steps as large as that would end it before its light has found its place.
+    slow = {"params": [model.shares], "lr": 0.003}
+    optimizer = torch.optim.Adam([{"params": [model.directions, model.log_softness]}, slow], lr=0.03)
+
+    for _ in range(120):
+        optimizer.zero_grad()
+        (model(floor, occluders, mask) - target).square().mean().backward()
+        optimizer.step()
+
+    main = model.directions[model.shares.sum(dim=1).argmax()]
+    angle = torch.rad2deg(torch.acos((main @ direction / main.norm()).clamp(-1, 1)))
+    assert angle < 5
+    assert (model(floor, occluders, mask) - target).square().mean() < 0.1 * (1 - target).square().mean()
+
+
+def test_parameters_are_part_of_the_picture_even_where_all_lights_went_out():
+    """A training in several processes waits for the gradient of every parameter, be it zero."""
+    model, (points, occluders, mask) = shadows(), scene()
+    with torch.no_grad():
+        model.shares.fill_(-0.01)
+
+    light = model(points, occluders, mask)
+
+    assert light.requires_grad
+    light.sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
+
+
+@pytest.mark.parametrize(("num_lights", "softness"), [(0, 0.1), (2, 0.0), (1, -1.0)])
+def test_wrong_settings_are_refused(num_lights, softness):
+    with pytest.raises(ValueError, match="num_lights must be at least 1 and softness positive"):
+        Shadows(num_lights=num_lights, softness=softness)
