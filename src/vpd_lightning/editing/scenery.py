@@ -18,6 +18,12 @@ def without_scenery(particles: Particles, chosen: Bool[Tensor, " particle"]) -> 
     return replace(scenery, mask=scenery.mask & ~_points_of(particles, scenery, chosen))
 
 
+def only_scenery(particles: Particles, chosen: Bool[Tensor, " particle"]) -> Scenery | None:
+    """Return the scenery with the points of the chosen particles alone."""
+    scenery = particles.scenery
+    return None if scenery is None else replace(scenery, mask=_points_of(particles, scenery, chosen))
+
+
 def transformed_scenery(
     particles: Particles,
     chosen: Bool[Tensor, " particle"],

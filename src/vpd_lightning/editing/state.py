@@ -10,7 +10,7 @@ from torch import Tensor
 
 from vpd_lightning.editing.clusters import object_clusters
 from vpd_lightning.editing.matching import match_frames
-from vpd_lightning.editing.scenery import joined_scenery, transformed_scenery, without_scenery
+from vpd_lightning.editing.scenery import joined_scenery, only_scenery, transformed_scenery
 from vpd_lightning.errors import EditError
 from vpd_lightning.simulator import Scene
 from vpd_lightning.types import Particles
@@ -71,7 +71,7 @@ def start_state(
 def chosen_slots(particles: Particles, chosen: Bool[Tensor, " particle"]) -> Particles:
     """Return only the chosen slots of a frame (batch axis of 1)."""
     kept = particles.mapped(lambda values: values[:, chosen])
-    return replace(kept, scenery=without_scenery(particles, ~chosen))
+    return replace(kept, scenery=only_scenery(particles, chosen))
 
 
 def joined(first: Particles, second: Particles) -> Particles:
@@ -85,6 +85,9 @@ def joined(first: Particles, second: Particles) -> Particles:
             f"Particles with {second.features.shape[-1]} features cannot join particles with "
             f"{first.features.shape[-1]}.\nEncode both scenes with the same model."
         )
+    stands_still = second.mask if second.moving is None else second.mask & ~second.moving
+    if first.scenery is not None and second.scenery is None and bool(stands_still.any()):
+        raise EditError("Only one of the two scenes has scenery.\nEncode both with the same model.")
     parts: dict[str, Any] = {"scenery": joined_scenery(first.scenery, second.scenery)}
     for item in fields(first):
         if item.name == "scenery":

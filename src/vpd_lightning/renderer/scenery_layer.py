@@ -84,9 +84,12 @@ class SceneryLayer(nn.Module):
     @torch.no_grad()
     def _candidates(self, scenery: Scenery, rays: Rays) -> Int[Tensor, "batch ray candidate"]:
         """Choose the points closest to each ray, hidden ones last, none behind the camera; -1 for none."""
-        sizes = torch.where(scenery.mask, scenery.sizes, torch.nan).nanmedian()
-        width = float(torch.nan_to_num(sizes, nan=1.0))
-        score = BesideAndBehind(self.near, 1.5 * width, 8 * width)
-        search = RaySearch(scenery.positions, scenery.mask, self.backend)
-        found = search.closest(rays.origins, rays.directions, self.num_candidates, score)
-        return torch.where(found.mask, found.index, -1)
+        sizes = torch.where(scenery.mask, scenery.sizes, torch.nan).nanmedian(dim=1).values
+        chosen = []
+        for member, width in enumerate(torch.nan_to_num(sizes, nan=1.0).tolist()):  # each has a width of its own
+            some = slice(member, member + 1)
+            score = BesideAndBehind(self.near, 1.5 * width, 8 * width)
+            search = RaySearch(scenery.positions[some], scenery.mask[some], self.backend)
+            found = search.closest(rays.origins[some], rays.directions[some], self.num_candidates, score)
+            chosen.append(torch.where(found.mask, found.index, -1))
+        return torch.cat(chosen)

@@ -44,16 +44,19 @@ class Shadows(nn.Module):
         there = mask[:, None].to(points.dtype)
         square = points.square().sum(-1, keepdim=True) + occluders.square().sum(-1)[:, None]
         square = torch.baddbmm(square, points, occluders.mT, alpha=-2)
-        # A share that reached zero has no gradient and stays there.
-        lit = (self.shares.detach() > 0).any(dim=1).nonzero().flatten().tolist()
-        for direction, shares, log_softness in ((directions[i], self.shares[i], self.log_softness[i]) for i in lit):
+        # Never less than no light; the gradient goes through, so that a light that went out may come back.
+        positive = self.shares + (self.shares.clamp(min=0) - self.shares).detach()
+        lit = (
+            range(len(positive)) if torch.is_grad_enabled() else (positive > 0).any(dim=1).nonzero().flatten().tolist()
+        )
+        for direction, shares, log_softness in ((directions[i], positive[i], self.log_softness[i]) for i in lit):
             width = log_softness.exp()
             towards = (occluders @ direction)[:, None] - (points @ direction)[..., None]
             beside = (square - towards.square()).clamp(min=0) / (2 * width.square())
             # What touches the point is its own surface; what is below it does not cast.
             ahead = torch.sigmoid(towards / (0.5 * width) - 2.0)
             blocked = (decay(-beside) * ahead * there).sum(dim=-1, keepdim=True)
-            light = light - shares.clamp(min=0) * (1 - decay(-blocked))
+            light = light - shares * (1 - decay(-blocked))
         return light.clamp(min=0.05)
 
 

@@ -1,14 +1,15 @@
 """One network evaluation per ray: two depth layers of nearby particles, composited over a learned background."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from vpd_lightning.geometry.decay import decay
+from vpd_lightning.geometry.occluders import occluders_of
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend
@@ -16,8 +17,6 @@ from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.renderer.scenery_layer import SceneryLayer, SeenScenery
 from vpd_lightning.renderer.shadows import Shadows
 from vpd_lightning.types import Particles, Rays, RenderedRays, Scenery, require_finite
-
-_NUM_OCCLUDERS = 128
 
 _DARKEST = 0.01
 """Colours nearer to 0 or 1 have no logit to add to."""
@@ -193,6 +192,9 @@ class SplatRenderer(AbstractRenderer):
         depths = (front * depth[..., :1] + back * depth[..., 1:] + left * far).squeeze(-1)
         return rgbs, depths, (front + back + left * opacity).squeeze(-1)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_kept": None}  # copies and files have no use for it
+
     def _seen_scenery(self, particles: Particles, rays: Rays) -> SeenScenery | None:
         """Return the scenery along the rays in the shadows of the particles that move now."""
         scenery = particles.scenery
@@ -209,7 +211,8 @@ class SplatRenderer(AbstractRenderer):
             colors = seen.colors
             if self.shadows is not None:
                 now = self.shadows(points.unflatten(1, (repeats, -1)).flatten(0, 1), *occluders_of(particles))
-                colors = colors * per_clip(now) / first
+                lit = colors * per_clip(now) / first
+                colors = lit + (lit.clamp(max=1) - lit).detach()  # what is too bright still learns to be less so
             parts = (colors, seen.distances, seen.opacities)
             return SeenScenery(*(part.unflatten(1, (repeats, -1)).flatten(0, 1) for part in parts))
 
@@ -220,10 +223,12 @@ class SplatRenderer(AbstractRenderer):
         """
         assert self.scenery is not None
         weights = [p for part in (self.scenery, self.shadows) if part is not None for p in part.parameters()]
-        key = (scenery, rays.origins, rays.directions, [p._version for p in weights])
+        held = [scenery, rays.origins, rays.directions]
+        read = [*weights, *held[1:], *(getattr(scenery, item.name) for item in fields(scenery))]
+        key = held, [tensor.dtype for tensor in read], [0 if t.is_inference() else t._version for t in read]
         if self._kept is not None and not torch.is_grad_enabled():
             kept, found = self._kept
-            if all(one is other for one, other in zip(key[:3], kept[:3], strict=True)) and key[3] == kept[3]:
+            if all(one is other for one, other in zip(held, kept[0], strict=True)) and key[1:] == kept[1:]:
                 return found
         seen = self.scenery(scenery, clip_rays)
         points = clip_rays.origins + seen.distances[..., None] * clip_rays.directions
@@ -311,12 +316,3 @@ class SplatRenderer(AbstractRenderer):
         search = RaySearch(particles.positions, particles.mask, self.candidate_backend)
         found = search.closest(origins, directions, count, score)
         return torch.where(found.mask, found.index, -1)
-
-
-def occluders_of(particles: Particles) -> tuple[Float[Tensor, "batch occluder 3"], Bool[Tensor, "batch occluder"]]:
-    """Return the first moving particles of each member, packed: they are in random order."""
-    mask = particles.mask if particles.moving is None else particles.mask & particles.moving
-    count = min(_NUM_OCCLUDERS, int(mask.sum(dim=1).max()) if mask.numel() else 0)
-    index = torch.sort((~mask).to(torch.uint8), dim=1, stable=True).indices[:, :count]
-    positions = torch.gather(particles.positions, 1, index[..., None].expand(-1, -1, 3))
-    return positions, torch.gather(mask, 1, index)

@@ -13,12 +13,10 @@ from vpd_lightning.errors import EmptyWorkspaceError
 from vpd_lightning.geometry import workspace
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.geometry.normals import depth_normals
+from vpd_lightning.geometry.occluders import occluders_of
 from vpd_lightning.geometry.workspace import inside_workspace
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles, RGBDFrames, require_finite
-
-_NUM_OCCLUDERS = 128
-"""Points of what moves that cast shadows; a body of a few hundred pixels is outlined by them."""
 
 
 class UnprojectingEncoder(AbstractEncoder):
@@ -121,11 +119,7 @@ class UnprojectingEncoder(AbstractEncoder):
         if self.use_normals or self.has_scenery:
             normals = depth_normals(frames.depth, frames.cameras).flatten(1, 3)
 
-        scenery = None
-        # That of the current frame is drawn; the frame before it has no other.
-        if self.has_scenery and purpose != "previous" and normals is not None and moving is not None:
-            occluders = self._occluders(points, candidates & moving, keys, purpose)
-            scenery = scenery_of(frames, points, normals, still, *occluders)
+        everywhere = points
         points = torch.where(candidates[..., None], points, torch.zeros_like(points))  # no NaN through padding
 
         def take(values: Tensor) -> Tensor:
@@ -134,27 +128,19 @@ class UnprojectingEncoder(AbstractEncoder):
         colors, features = take(frames.rgb.flatten(1, 3)), features_at(index)
         if self.color_features:
             features = torch.cat([colors.to(features), features[..., 3:]], dim=-1)
-        return Particles(
+        particles = Particles(
             positions=take(points) * valid[..., None],
             features=features * valid[..., None],
             mask=valid,
             colors=colors,
             moving=None if moving is None else torch.gather(moving, 1, index) & valid,
             normals=take(normals) if self.use_normals and normals is not None else None,
-            scenery=scenery,
         )
-
-    @staticmethod
-    def _occluders(
-        points: Float[Tensor, "batch point 3"], moving: Bool[Tensor, "batch point"], keys: RandomKeys, purpose: str
-    ) -> tuple[Tensor, Tensor]:
-        drawn = [
-            workspace.choose(allowed, _NUM_OCCLUDERS, generator)
-            for allowed, generator in zip(moving, keys.generators(f"occluders/{purpose}"), strict=True)
-        ]
-        index, mask = (torch.stack(parts) for parts in zip(*drawn, strict=True))
-        taken = torch.gather(points, 1, index[..., None].expand(-1, -1, 3))
-        return torch.where(mask[..., None], taken, 0.0), mask
+        # That of the current frame is drawn; the frame before it has no other.
+        if not self.has_scenery or purpose == "previous":
+            return particles
+        assert normals is not None
+        return replace(particles, scenery=scenery_of(frames, everywhere, normals, still, *occluders_of(particles)))
 
     @torch.no_grad()
     def observe(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> dict[str, Tensor]:

@@ -1,0 +1,28 @@
+"""Which of the moving particles cast shadows: a fixed number of them, spread over all."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from vpd_lightning.types import Particles
+
+_NUM_OCCLUDERS = 128
+"""A body of a few hundred pixels is outlined by as many; shadows cost points times occluders."""
+
+
+def occluders_of(particles: Particles) -> tuple[Float[Tensor, "batch occluder 3"], Bool[Tensor, "batch occluder"]]:
+    """Return places (metres) of moving particles, and which of them there are; evenly spread over their slots.
+
+    Slots are in random order but after edits, where what was added comes last and casts shadows as well.
+    """
+    mask = particles.mask if particles.moving is None else particles.mask & particles.moving
+    counts = mask.sum(dim=1)
+    num = min(_NUM_OCCLUDERS, int(counts.max()) if mask.numel() else 0)
+    ordinal = torch.arange(num, device=mask.device)
+    ranks = torch.where(counts[:, None] > num, ordinal * counts[:, None] // max(num, 1), ordinal)
+    index = torch.sort((~mask).to(torch.uint8), dim=1, stable=True).indices.gather(
+        1, ranks.clamp(max=mask.shape[1] - 1)
+    )
+    positions = torch.gather(particles.positions, 1, index[..., None].expand(-1, -1, 3))
+    there = torch.gather(mask, 1, index) & (ordinal < counts[:, None])
+    return torch.where(there[..., None], positions, 0.0), there
