@@ -6,6 +6,9 @@ from torch import Tensor, nn
 
 from vpd_lightning.geometry.decay import decay
 
+_POINTS_PER_CHUNK = 1024
+"""Points at a time without gradients: with 128 occluders half a megabyte, which stays in cache."""
+
 
 class Shadows(nn.Module):
     """How much light reaches a point past the bodies, from ``num_lights`` lights far away.
@@ -33,9 +36,14 @@ class Shadows(nn.Module):
         mask: Bool[Tensor, "batch occluder"],
     ) -> Float[Tensor, "batch point 3"]:
         """Return the share of light per colour channel that reaches the points, in (0, 1]."""
-        light = torch.ones_like(points)
         if occluders.shape[1] == 0:
-            return light
+            return torch.ones_like(points)
+        if torch.is_grad_enabled() or points.shape[1] <= _POINTS_PER_CHUNK:
+            return self._light(points, occluders, mask)
+        return torch.cat([self._light(some, occluders, mask) for some in points.split(_POINTS_PER_CHUNK, dim=1)], dim=1)
+
+    def _light(self, points: Tensor, occluders: Tensor, mask: Tensor) -> Float[Tensor, "batch point 3"]:
+        light = torch.ones_like(points)
         # Seen from among the occluders, so that squares of coordinates keep their digits.
         count = mask.sum(dim=1).clamp(min=1)[:, None, None]
         center = torch.where(mask[..., None], occluders, 0.0).sum(dim=1, keepdim=True) / count

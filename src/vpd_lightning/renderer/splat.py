@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from vpd_lightning.geometry.decay import decay
@@ -20,6 +20,14 @@ from vpd_lightning.types import Particles, Rays, RenderedRays, Scenery, require_
 
 _DARKEST = 0.01
 """Colours nearer to 0 or 1 have no logit to add to."""
+
+
+class _Layers(NamedTuple):
+    """The front and the back layer of rays; distances along them in metres."""
+
+    colors: Float[Tensor, "batch ray 2 3"]
+    alphas: Float[Tensor, "batch ray 2"]
+    distances: Float[Tensor, "batch ray 2"]
 
 
 class SplatRenderer(AbstractRenderer):
@@ -149,48 +157,78 @@ class SplatRenderer(AbstractRenderer):
                 mask=pad(particles.mask, (0, 1)),
             )  # without normals: there is nothing to face
         index = self._candidates(particles, rays.origins, rays.directions)
-        slices = [slice(s, s + self.ray_chunk_size) for s in range(0, max(num_rays, 1), self.ray_chunk_size)]
-        chunks = [
-            self._render(
-                particles,
-                index[:, some],
-                rays.origins[:, some],
-                rays.directions[:, some],
-                None if seen is None else SeenScenery(*(part[:, some] for part in seen)),
-            )
-            for some in slices
-        ]
-        rgbs, depths, opacities = (torch.cat(parts, dim=1) for parts in zip(*chunks, strict=True))
-        return RenderedRays(rgbs, depths, opacities)
+        if seen is not None:
+            return self._before_scenery(particles, index, rays, seen)
+        chunks = []
+        for some in self._chunks(num_rays):
+            lines = Rays(rays.origins[:, some], rays.directions[:, some])
+            layers = self._rendered_layers(particles, index[:, some], lines, has_scenery=False)
+            far = torch.full_like(layers.distances[..., :1], self.far)
+            chunks.append(_composited(layers, self._background(lines), far, torch.zeros_like(far)))
+        return _joined(chunks)
 
-    def _render(
-        self, particles: Particles, index: Tensor, origins: Tensor, directions: Tensor, seen: SeenScenery | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        device_type = origins.device.type
-        with torch.autocast(device_type, enabled=False):
+    def _before_scenery(self, particles: Particles, index: Tensor, rays: Rays, seen: SeenScenery) -> RenderedRays:
+        """Render moving particles before the scenery: by the network only where a ray passes near one."""
+        opacity, distance = seen.opacities[..., None], seen.distances[..., None]
+        behind = opacity * seen.colors + (1 - opacity) * self._background(rays)
+        far = opacity * distance + (1 - opacity) * self.far
+        rendered = RenderedRays(behind, far.squeeze(-1), seen.opacities)
+        rows = self._passing_near(particles, index, rays).flatten().nonzero().flatten()
+        if len(rows) == 0:
+            return rendered
+        # All members as one, whose rays are the chosen ones.
+        batch = torch.arange(len(index), device=index.device)[:, None, None]
+        index = torch.where(index >= 0, index + batch * particles.num_particles, -1).flatten(0, 1)
+        as_one = particles.mapped(lambda values: values.flatten(0, 1)[None])
+        flat = [part.flatten(0, 1) for part in (rays.origins, rays.directions, behind, far, opacity, distance)]
+        chunks = []
+        for chunk in self._chunks(len(rows)):
+            some = rows[chunk]
+            origins, directions, *parts = (part.index_select(0, some)[None] for part in flat)
+            behind, far, opacity, distance = parts
+            layers = self._rendered_layers(as_one, index.index_select(0, some)[None], Rays(origins, directions), True)
+            # Scenery in front hides a layer; a body that stands on it is as far away as it is.
+            hidden = opacity * torch.sigmoid((layers.distances - distance) / (0.1 * self.layer_depth) - 5.0)
+            layers = layers._replace(alphas=layers.alphas * (1 - hidden))
+            chunks.append(_composited(layers, behind, far, opacity))
+        found = _joined(chunks)
+
+        def put(values: Tensor, new: Tensor) -> Tensor:
+            return values.flatten(0, 1).index_copy(0, rows, new[0].to(values.dtype)).view_as(values)
+
+        return RenderedRays(
+            put(rendered.rgbs, found.rgbs), put(rendered.depths, found.depths), put(rendered.opacities, found.opacities)
+        )
+
+    @torch.no_grad()
+    def _passing_near(self, particles: Particles, index: Tensor, rays: Rays) -> Bool[Tensor, "batch ray"]:
+        """Return which rays pass within the widest kernel's width of a moving particle; others cannot meet one."""
+        batch = torch.arange(len(index), device=index.device)[:, None, None]
+        flat = (batch * particles.num_particles + index.clamp(min=0)).flatten()
+        offsets = particles.positions.flatten(0, 1).index_select(0, flat).unflatten(0, index.shape)
+        offsets = offsets - rays.origins[:, :, None]
+        along = (offsets * rays.directions[:, :, None]).sum(dim=-1)
+        square = offsets.square().sum(dim=-1) - along.square()
+        return ((square < max(self.kernel_scales) ** 2) & (index >= 0)).any(dim=-1)
+
+    def _chunks(self, num_rays: int) -> list[slice]:
+        return [slice(s, s + self.ray_chunk_size) for s in range(0, max(num_rays, 1), self.ray_chunk_size)]
+
+    def _background(self, rays: Rays) -> Float[Tensor, "batch ray 3"]:
+        return torch.sigmoid(self.background(self._encoded(rays.directions)).to(rays.origins.dtype))
+
+    def _rendered_layers(self, particles: Particles, index: Tensor, rays: Rays, has_scenery: bool) -> _Layers:
+        """Return what the network makes of the front and the back layer of each ray."""
+        origins, directions = rays.origins, rays.directions
+        with torch.autocast(origins.device.type, enabled=False):
             inputs, depth, sees_any = self._layers(particles, index, origins, directions)
         outputs = self.network(torch.cat([inputs, directions], dim=-1)).to(origins.dtype)
         logits = outputs[..., :6].unflatten(-1, (2, 3))
         if self.color_features:
             means = inputs.unflatten(-1, (2, -1))[..., :3].to(logits.dtype)
             logits = logits + torch.logit(means.clamp(_DARKEST, 1 - _DARKEST))
-        colors = torch.sigmoid(logits)
-        alphas = torch.sigmoid(outputs[..., 6:] + (1.0 if seen is None else self._coverage(inputs)))
-        background = torch.sigmoid(self.background(self._encoded(directions)).to(origins.dtype))
-        alphas = alphas * sees_any
-        far, opacity = self.far, 0.0
-        if seen is not None:
-            # Scenery in front hides a layer; a body that stands on it is as far away as it is.
-            opacity, far = seen.opacities[..., None], seen.distances[..., None]
-            behind = torch.sigmoid((depth - far) / (0.1 * self.layer_depth) - 5.0)
-            alphas = alphas * (1 - opacity * behind)
-            background = opacity * seen.colors + (1 - opacity) * background
-            far = opacity * far + (1 - opacity) * self.far
-        front, back = alphas[..., :1], (1 - alphas[..., :1]) * alphas[..., 1:]
-        left = 1 - front - back
-        rgbs = front * colors[..., 0, :] + back * colors[..., 1, :] + left * background
-        depths = (front * depth[..., :1] + back * depth[..., 1:] + left * far).squeeze(-1)
-        return rgbs, depths, (front + back + left * opacity).squeeze(-1)
+        before_training = self._coverage(inputs) if has_scenery else 1.0
+        return _Layers(torch.sigmoid(logits), torch.sigmoid(outputs[..., 6:] + before_training) * sees_any, depth)
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_kept": None}  # copies and files have no use for it
@@ -316,3 +354,19 @@ class SplatRenderer(AbstractRenderer):
         search = RaySearch(particles.positions, particles.mask, self.candidate_backend)
         found = search.closest(origins, directions, count, score)
         return torch.where(found.mask, found.index, -1)
+
+
+def _composited(layers: _Layers, behind: Tensor, far: Tensor, opacity: Tensor) -> RenderedRays:
+    """Return the layers before something of a colour, a distance and an opacity (the latter two ``batch ray 1``)."""
+    front, back = layers.alphas[..., :1], (1 - layers.alphas[..., :1]) * layers.alphas[..., 1:]
+    left = 1 - front - back
+    rgbs = front * layers.colors[..., 0, :] + back * layers.colors[..., 1, :] + left * behind
+    depths = (front * layers.distances[..., :1] + back * layers.distances[..., 1:] + left * far).squeeze(-1)
+    return RenderedRays(rgbs, depths, (front + back + left * opacity).squeeze(-1))
+
+
+def _joined(chunks: Sequence[RenderedRays]) -> RenderedRays:
+    rgbs, depths, opacities = (
+        torch.cat([getattr(chunk, name) for chunk in chunks], dim=1) for name in ("rgbs", "depths", "opacities")
+    )
+    return RenderedRays(rgbs, depths, opacities)
