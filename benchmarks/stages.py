@@ -21,6 +21,7 @@ FEATURE_DIM = 16
 ROOT = {
     "feature_dim": FEATURE_DIM,
     "color_features": False,
+    "scenery": False,
     "checkpoint_dynamics": True,
 }  # keys of the root of conf/train.yaml
 USED = (
@@ -28,8 +29,8 @@ USED = (
     "dynamics/hierarchical_gnn_small", "renderer/point_nerf", "renderer/point_nerf_small", "renderer/surface",
     "renderer/splat", "model/vpd",
 )  # fmt: skip
-# ${vpd_lookup:${size},{small:0.25},0.1}: what holds at sizes without an entry comes last.
-_BY_SIZE = re.compile(r"^\$\{vpd_lookup:\$\{size\},\{.*\},(.*)\}$")
+# ${vpd_lookup:${size},{small:0.25},0.1}: what holds without an entry comes last; here nothing has scenery.
+_BY_SIZE = re.compile(r"^\$\{vpd_lookup:\$\{(?:size|scenery)\},\{.*\},(.*)\}$")
 _PREPARED: dict[str, dict[str, Any]] = {}  # sections read from a JSON file instead of YAML
 
 

@@ -168,10 +168,7 @@ def test_a_batch_is_the_mean_of_its_members():
     output = replace(output, auxiliary=dict(output.auxiliary, future_mask=few))
 
     def member(index):
-        states = [
-            replace(state, **{name: value[index : index + 1] for name, value in vars(state).items()})
-            for state in output.states
-        ]
+        states = [state.mapped(lambda values: values[index : index + 1]) for state in output.states]
         auxiliary = {name: value[index : index + 1] for name, value in output.auxiliary.items()}
         return loss()(SimulatorOutput(None, states, auxiliary), video_batch(1)).item()
 

@@ -36,8 +36,8 @@ class Shadows(nn.Module):
         mask: Bool[Tensor, "batch occluder"],
     ) -> Float[Tensor, "batch point 3"]:
         """Return the share of light per colour channel that reaches the points, in (0, 1]."""
-        if occluders.shape[1] == 0:
-            return torch.ones_like(points)
+        if occluders.shape[1] == 0:  # each weight has a gradient all the same, as training on several devices needs
+            return torch.ones_like(points) + 0 * sum(weight.sum() for weight in self.parameters())
         if torch.is_grad_enabled() or points.shape[1] <= _POINTS_PER_CHUNK:
             return self._light(points, occluders, mask)
         return torch.cat([self._light(some, occluders, mask) for some in points.split(_POINTS_PER_CHUNK, dim=1)], dim=1)
