@@ -173,9 +173,10 @@ class SplatRenderer(AbstractRenderer):
         behind = opacity * seen.colors + (1 - opacity) * self._background(rays)
         far = opacity * distance + (1 - opacity) * self.far
         rendered = RenderedRays(behind, far.squeeze(-1), seen.opacities)
-        rows = self._passing_near(particles, index, rays).flatten().nonzero().flatten()
-        if len(rows) == 0:
-            return rendered
+        is_near = self._passing_near(particles, index, rays).flatten()
+        rows = is_near.nonzero().flatten()
+        if len(rows) == 0:  # one ray all the same, so that each weight has a gradient, as on several devices it must
+            rows = rows.new_zeros(min(1, opacity.numel()))
         # All members as one, whose rays are the chosen ones.
         batch = torch.arange(len(index), device=index.device)[:, None, None]
         index = torch.where(index >= 0, index + batch * particles.num_particles, -1).flatten(0, 1)
@@ -189,7 +190,7 @@ class SplatRenderer(AbstractRenderer):
             layers = self._rendered_layers(as_one, index.index_select(0, some)[None], Rays(origins, directions), True)
             # Scenery in front hides a layer; a body that stands on it is as far away as it is.
             hidden = opacity * torch.sigmoid((layers.distances - distance) / (0.1 * self.layer_depth) - 5.0)
-            layers = layers._replace(alphas=layers.alphas * (1 - hidden))
+            layers = layers._replace(alphas=layers.alphas * (1 - hidden) * is_near[some][None, :, None])
             chunks.append(_composited(layers, behind, far, opacity))
         found = _joined(chunks)
 
