@@ -205,6 +205,16 @@ def test_a_whole_protocol_takes_nothing_from_the_run() -> None:
     assert choose_protocol({**PROTOCOL, "num_trajectories": None}, PROTOCOL).num_trajectories is None
 
 
+def test_a_run_from_before_a_setting_is_evaluated_without_it() -> None:
+    older = {key: value for key, value in PROTOCOL.items() if key != "draw_references"}
+    wanted = dict.fromkeys([*PROTOCOL, "draw_references"])
+    assert not choose_protocol(wanted, older).draw_references
+    assert choose_protocol({**wanted, "draw_references": True}, older).draw_references
+    whole = {**PROTOCOL, "num_trajectories": None, "draw_references": None}
+    assert choose_protocol(whole, {**older, "num_trajectories": 3}).num_trajectories is None
+    assert not choose_protocol(whole, None).draw_references
+
+
 def test_a_run_without_protocol_needs_one() -> None:
     with pytest.raises(ConfigError, match="protocol=paper"):
         choose_protocol(dict.fromkeys(PROTOCOL), None)

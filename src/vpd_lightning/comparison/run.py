@@ -18,7 +18,7 @@ from vpd_lightning.metrics.registry import HEADLINE, SOURCES, compared
 KNOWN_FORMATS = (1,)
 _MAX_BYTES = 64 * 2**20
 # What a protocol says that decides no column of a table, or that belongs to the system.
-_FREE = ("input_views", "num_bootstrap", "num_long_steps", "long_start_frame", "num_context_frames")
+_FREE = ("input_views", "num_bootstrap", "num_long_steps", "long_start_frame", "num_context_frames", "draw_references")
 _RELATIVE_TOLERANCE = 1e-6  # metrics.json prints float64; sums in another order differ by far less
 
 

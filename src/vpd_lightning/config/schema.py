@@ -122,6 +122,7 @@ class ProtocolConfig:
     body_margin: float | None = None
     num_chamfer_points: int | None = None
     num_bootstrap: int | None = None
+    draw_references: bool | None = None
 
 
 @dataclass

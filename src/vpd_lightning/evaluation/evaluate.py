@@ -1,17 +1,19 @@
 """Run the protocol over a held-out split."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.errors import DataError
+from vpd_lightning.evaluation.drawn_references import drawn_references
 from vpd_lightning.evaluation.kept_mean import kept_training_mean
 from vpd_lightning.evaluation.long_rollout import LongRollout, judge_long_rollout
 from vpd_lightning.evaluation.measuring import Arrays, ClipMetrics
@@ -38,7 +40,8 @@ Progress = Callable[[str, int, int], None]
 class Evaluation:
     """Everything measured; the first axis of every array counts clips, ``trajectory`` is the trajectory of each clip.
 
-    ``images[system][metric]`` and ``native[metric]`` (at the system's own ``resolution``) are [clip, view, step],
+    ``images[system][metric]``, ``drawn[motion][metric]`` (other motions, drawn by the model's renderer) and
+    ``native[metric]`` (at the system's own ``resolution``) are [clip, view, step],
     ``reconstruction[metric]`` [clip, view, 1], ``motion[metric]`` [clip, object, step], and ``blocks[metric][part]``
     [clip, step] where all particles are judged together, [clip, object, step] where bodies are. They are empty for what
     the system or the recordings do not have: a resolution of its own (None), particles, ground truth. ``kept`` are the
@@ -53,6 +56,7 @@ class Evaluation:
     resolution: int | None
     images: dict[str, Arrays]
     reconstruction: Arrays
+    drawn: dict[str, Arrays]
     native: Arrays
     motion: Arrays
     blocks: dict[str, Arrays]
@@ -65,6 +69,7 @@ class Evaluation:
         """All arrays under flat names, for an NPZ file."""
         groups: dict[str, Arrays] = {
             **self.images,
+            **self.drawn,
             "reconstruction": self.reconstruction,
             "native": self.native,
             "motion": self.motion,
@@ -112,9 +117,16 @@ def evaluate(
         progress("clips", number, num_clips)
         if clip.rgb.shape[1:] != mean_image.shape:
             raise DataError(f"{clip.name} has images {tuple(clip.rgb.shape[1:])}, training {tuple(mean_image.shape)}.")
-        prediction = predict_clip(system, without_depth(clip) if hide_depth else clip, input_views)
+        shown = without_depth(clip) if hide_depth else clip
+        prediction = predict_clip(system, shown, input_views)
+        drawn: Mapping[str, Tensor] = {}
         tick = time.perf_counter()
-        metrics.update(number, clip, prediction, protocol, mean_image, constants.get(clip.start))
+        is_known = prediction.positions is not None and clip.state is not None
+        if protocol.draw_references and is_known and isinstance(system, PredictsVideo):
+            drawn = drawn_references(system, encode_clip(system, shown, input_views), clip, protocol.body_margin)
+            watch["draw"] = watch.get("draw", 0.0) + time.perf_counter() - tick
+        tick = time.perf_counter()
+        metrics.update(number, clip, prediction, protocol, mean_image, constants.get(clip.start), drawn)
         names.append(clip.name)
         trajectory.append(clip.trajectory)
         timings.append(prediction.seconds)
@@ -136,6 +148,7 @@ def evaluate(
         resolution=resolution,
         images={source: metrics.image_arrays(source, num_clips) for source in SOURCES},
         reconstruction=metrics.reconstruction_arrays(num_clips),
+        drawn=metrics.drawn_arrays(num_clips),
         native=metrics.native_arrays(num_clips),
         motion=metrics.motion_arrays(num_clips),
         blocks=metrics.block_arrays(num_clips),

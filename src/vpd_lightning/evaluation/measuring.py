@@ -1,6 +1,6 @@
 """Measure predicted clips by every metric of the list."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from vpd_lightning.evaluation.protocol import Protocol
 from vpd_lightning.geometry.resizing import resize_images
 from vpd_lightning.metrics.metric_info import MetricInfo
 from vpd_lightning.metrics.registry import (
+    DRAWN,
     REFERENCES,
     SOURCES,
     body_metrics,
@@ -33,13 +34,15 @@ Arrays = dict[str, NDArray[np.float64]]
 class ClipMetrics:
     """The metrics of an evaluation, filled clip by clip.
 
-    ``images[source]`` judge the model and both references in its place, ``reconstruction`` the decoded last input
-    frame, ``native`` the model at its own resolution, ``particles`` and ``bodies`` where it has particles (and where
+    ``images[source]`` judge the model and both references in its place, ``drawn[source]`` other motions that its
+    renderer draws, where they are asked for, ``reconstruction`` the decoded last input frame, ``native`` the model at
+    its own resolution, ``particles`` and ``bodies`` where it has particles (and where
     there is ground truth). What a system does not have is never measured.
     """
 
     def __init__(self) -> None:
         self.images = {source: _sample_metrics(image_metrics()) for source in SOURCES}
+        self.drawn = {source: _sample_metrics(image_metrics()) for source in DRAWN}
         self.reconstruction = _sample_metrics(still_scores())
         self.native = _sample_metrics(image_metrics())
         self.particles = _sample_metrics(particle_metrics())
@@ -53,15 +56,20 @@ class ClipMetrics:
         protocol: Protocol,
         mean_image: Float[Tensor, "view height width 3"],
         constants: Float[Tensor, "step object 3"] | None,
+        drawn: Mapping[str, Float[Tensor, "step_or_1 view height width 3"]],
     ) -> None:
-        """Compare a prediction, and both references in its place, with the truth of clip ``number``."""
+        """Compare a prediction, and the references in its place, with the truth of clip ``number``."""
         moving = moving_pixels(clip, protocol)
-        truth = TrueImages(as_float(clip.target_rgb), moving, protocol.min_moving_pixels)
         last_input = as_float(clip.rgb[-1:])
+        kept = last_input if _same_cameras(clip) else None
+        threshold = protocol.moving_threshold
+        truth = TrueImages(as_float(clip.target_rgb), moving, protocol.min_moving_pixels, kept, threshold)
         # Both references are one image per view: what does not depend on the step is computed once.
         stand_ins = dict(zip(REFERENCES, (last_input, mean_image[None]), strict=True))
         for source, pred in {"model": prediction.images, **stand_ins}.items():
             _update(self.images[source], number, pred.nan_to_num(0.0), truth)
+        for source, pred in drawn.items():
+            _update(self.drawn[source], number, pred.nan_to_num(0.0), truth)
         decoded = prediction.reconstruction.nan_to_num(0.0)[None]
         _update(self.reconstruction, number, decoded, TrueImages(last_input))
         if prediction.native is not None and prediction.native.shape == prediction.images.shape:
@@ -80,6 +88,11 @@ class ClipMetrics:
     def image_arrays(self, source: str, num_clips: int) -> Arrays:
         """Every part of the metrics of images, axes ``clip view step``."""
         return _image_arrays(self.images[source], num_clips)
+
+    def drawn_arrays(self, num_clips: int) -> dict[str, Arrays]:
+        """The same for each motion that the renderer drew of every clip."""
+        found = {source: _image_arrays(metrics, num_clips) for source, metrics in self.drawn.items()}
+        return {source: arrays for source, arrays in found.items() if arrays}
 
     def native_arrays(self, num_clips: int) -> Arrays:
         """The same at the model's own resolution; empty where it has none."""
@@ -131,6 +144,14 @@ def _image_arrays(metrics: dict[str, SampleMetric], num_clips: int) -> Arrays:
     return {name: np.ascontiguousarray(values.swapaxes(1, 2)) for part in parts for name, values in part.items()}
 
 
+def _same_cameras(clip: Clip) -> bool:
+    """Whether all cameras stand still from the last input frame on."""
+    pairs = (
+        (getattr(clip.cameras, name), getattr(clip.target_cameras, name)) for name in ("cam_to_world", "intrinsics")
+    )
+    return all(bool((later == before[-1:]).all()) for before, later in pairs)
+
+
 def _native(
     native: Float[Tensor, "step view resolution resolution 3"], clip: Clip, moving: Tensor, protocol: Protocol
 ) -> tuple[Tensor, TrueImages]:
@@ -140,4 +161,6 @@ def _native(
     share = resize_images(moving[..., None].expand(*moving.shape, 3).float(), resolution)[..., 0]
     scale = (resolution / moving.shape[-2]) * (resolution / moving.shape[-1])
     min_pixels = max(1, round(protocol.min_moving_pixels * scale))
-    return native.nan_to_num(0.0), TrueImages(colors, torch.ge(share, 0.5), min_pixels)
+    last_input = resize_images(as_float(clip.rgb[-1:]), resolution) if _same_cameras(clip) else None
+    truth = TrueImages(colors, torch.ge(share, 0.5), min_pixels, last_input, protocol.moving_threshold)
+    return native.nan_to_num(0.0), truth

@@ -106,11 +106,16 @@ def encode_clip(simulator: PredictsVideo, clip: Clip, input_views: Sequence[int]
     return simulator.encode(clip.rgb[:, views], clip.depth[:, views], clip.cameras[:, views])
 
 
+def stand_still(cameras: Cameras) -> bool:
+    """Whether cameras (axes ``step view``) are the same at all steps."""
+    return all(bool((matrix == matrix[:1]).all()) for matrix in (cameras.cam_to_world, cameras.intrinsics))
+
+
 def render_steps(
     simulator: PredictsVideo, states: Sequence[Particles], cameras: Cameras
 ) -> Float[Tensor, "step view height width 3"]:
     """Render state ``i`` from cameras ``i`` (axes ``step view``); one call where the cameras stand still."""
-    if all(bool((matrix == matrix[:1]).all()) for matrix in (cameras.cam_to_world, cameras.intrinsics)):
+    if stand_still(cameras):
         return simulator.render(states, cameras[0])
     return torch.cat([simulator.render([state], cameras[step]) for step, state in enumerate(states)])
 

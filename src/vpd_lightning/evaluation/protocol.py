@@ -18,9 +18,11 @@ class Protocol:
     A clip that starts at frame ``s`` shows the model frames ``s`` and ``s + 1`` (to one that needs more, those before
     them as well) and asks for the ``num_steps`` frames behind them: every model predicts the same frames.
     ``num_trajectories`` limits the split to its first files (None: all). ``num_long_steps`` (0: none) rolls the clips
-    of ``long_start_frame`` out further, without images. ``moving_threshold`` is a colour difference in [0, 1], used
-    where there is no segmentation; images with fewer than ``min_moving_pixels`` have no moving PSNR. ``body_margin``
+    of ``long_start_frame`` out further, without images. ``moving_threshold`` is a colour difference in [0, 1] from
+    which on a pixel has changed, and counts as moving where there is no segmentation; images with fewer than
+    ``min_moving_pixels`` such pixels have no moving PSNR and no intersection over union. ``body_margin``
     (metres) grows a body's true box, or its surface where it is soft, when its particles are picked.
+    ``draw_references`` also judges other motions that the model's renderer draws, at about twice the time.
     """
 
     split: str
@@ -34,6 +36,7 @@ class Protocol:
     body_margin: float
     num_chamfer_points: int
     num_bootstrap: int
+    draw_references: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_frames", tuple(self.start_frames))

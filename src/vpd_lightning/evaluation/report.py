@@ -37,9 +37,9 @@ def metrics_of(evaluation: Evaluation, protocol: Protocol, identity: Mapping[str
     Every metric is an object with ``mean`` (over images), ``ci95`` (bootstrap over trajectories) and ``per_step``;
     distances are metres; ``events`` are figures over bodies. Values that do not exist are null: a system without
     particles has no ``motion``, ``events`` and ``long_rollout`` and nothing else that is measured of particles, one
-    that predicts at the resolution of the truth has no ``native``.
+    that predicts at the resolution of the truth has no ``native``, and ``drawn`` has the motions that were drawn.
     """
-    systems = {system: _image_summary(evaluation, protocol, system) for system in SOURCES}
+    systems = {system: _image_summary(evaluation, protocol, evaluation.images[system]) for system in SOURCES}
     summary = _summarizer(evaluation, protocol)
     return {
         "format_version": FORMAT_VERSION,
@@ -57,6 +57,8 @@ def metrics_of(evaluation: Evaluation, protocol: Protocol, identity: Mapping[str
         **{info.name: _parts_summary(evaluation.blocks.get(info.name), summary) for info in blocks()},
         "reconstruction": {name: summary(values)["mean"] for name, values in evaluation.reconstruction.items()},
         "references": {system: systems[system] for system in REFERENCES},
+        "drawn": {motion: _image_summary(evaluation, protocol, arrays) for motion, arrays in evaluation.drawn.items()}
+        or None,
         "motion": _motion_summary(evaluation, protocol),
         "events": events_of(evaluation.motion),
         "long_rollout": _long_summary(evaluation.long_rollouts),
@@ -68,8 +70,10 @@ def _summarizer(evaluation: Evaluation, protocol: Protocol) -> Any:
     return lambda values: summarize(values, evaluation.trajectory, protocol.num_bootstrap)
 
 
-def _image_summary(evaluation: Evaluation, protocol: Protocol, system: str) -> dict[str, Any]:
-    summary, arrays = _summarizer(evaluation, protocol), evaluation.images[system]
+def _image_summary(
+    evaluation: Evaluation, protocol: Protocol, arrays: Mapping[str, NDArray[np.float64]]
+) -> dict[str, Any]:
+    summary = _summarizer(evaluation, protocol)
     num_views = arrays[HEADLINE].shape[1]
     inputs = np.isin(np.arange(num_views), evaluation.input_views)
     result = {}
@@ -196,7 +200,7 @@ def write_metrics(folder: Path, metrics: Mapping[str, Any], evaluation: Evaluati
 def step_table(metrics: Mapping[str, Any]) -> dict[str, list[float | None]]:
     """Collect every per-step curve under a flat name; step 1 is the first predicted frame."""
     columns: dict[str, list[float | None]] = {}
-    for system, values in (("model", metrics), *metrics["references"].items()):
+    for system, values in (("model", metrics), *metrics["references"].items(), *(metrics.get("drawn") or {}).items()):
         for info in (info for info in image_metrics() if info.name in values):  # older files have fewer
             columns[f"{system}/{info.name}"] = values[info.name]["per_step"]
     for info in blocks():

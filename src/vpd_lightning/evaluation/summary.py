@@ -5,7 +5,15 @@ from typing import Any
 
 from vpd_lightning.evaluation.report import ratio_name
 from vpd_lightning.metrics.metric_info import MetricInfo
-from vpd_lightning.metrics.registry import REFERENCES, blocks, image_metrics, motion_metrics, still_scores
+from vpd_lightning.metrics.registry import (
+    DRAWN,
+    REFERENCES,
+    blocks,
+    image_metrics,
+    motion_metrics,
+    scores,
+    still_scores,
+)
 
 
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
@@ -19,6 +27,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
         "",
         *_image_lines(metrics),
         *_unmeasured_lines(metrics),
+        *_drawn_lines(metrics),
         *_other_lines(metrics),
     ]
     if metrics["motion"]:
@@ -70,6 +79,25 @@ def _image_lines(metrics: Mapping[str, Any]) -> list[str]:
         f"{'':{width}}{'model':>9}{'copy last':>11}{'train mean':>12}{'gain':>8}",
         *(_image_line(info, width, metrics) for info in infos),
     ]
+
+
+def _drawn_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Other motions drawn by the same renderer, where they were asked for."""
+    drawn = metrics.get("drawn")
+    if not drawn:
+        asked = metrics["protocol"].get("draw_references")
+        return ["other motions were not drawn: they need particles, and ground truth of every clip"] if asked else []
+    names = [name for name in DRAWN if name in drawn]
+    infos = [info for info in scores() if info.in_summary and info.name in metrics]
+    width = _label_width(info.label for info in infos)
+    lines = ["", f"{'same renderer':{width}}{'model':>9}" + "".join(f"{DRAWN[name]:>20}" for name in names)]
+    for info in infos:
+        means = [info.shown(drawn[name][info.name]["mean"]) for name in names]
+        lines.append(
+            f"{info.label:{width}}{info.shown(metrics[info.name]['mean']):>9}"
+            + "".join(f"{mean:>20}" for mean in means)
+        )
+    return lines
 
 
 def _unmeasured_lines(metrics: Mapping[str, Any]) -> list[str]:

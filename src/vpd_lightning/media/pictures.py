@@ -12,12 +12,25 @@ from numpy.typing import NDArray
 
 from vpd_lightning.files import AtomicPath
 from vpd_lightning.media.video import enlarge, error_image, framed, label_bar
-from vpd_lightning.metrics.registry import referenced, references_of, scores
+from vpd_lightning.metrics.registry import (
+    DRAWN,
+    NOTHING_MOVES,
+    TRUE_MOTION,
+    TRUE_VELOCITY,
+    referenced,
+    references_of,
+    scores,
+)
 
 _STYLES: dict[str, dict[str, Any]] = {
     "model": {"color": "#1f5fbf", "linewidth": 2.2, "label": "model"},
     "copy_last": {"color": "#d0762a", "linewidth": 1.4, "linestyle": "--", "label": "copy last input frame"},
     "train_mean": {"color": "#777777", "linewidth": 1.4, "linestyle": ":", "label": "training mean"},
+}
+_DRAWN_STYLES: dict[str, dict[str, Any]] = {
+    NOTHING_MOVES: {"color": "#b04a8a", "linewidth": 1.2, "linestyle": "--"},
+    TRUE_VELOCITY: {"color": "#b04a8a", "linewidth": 1.2, "linestyle": "-."},
+    TRUE_MOTION: {"color": "#2a8a4a", "linewidth": 1.2},
 }
 _MOTION_STYLES: tuple[dict[str, Any], ...] = tuple(
     {key: value for key, value in style.items() if key != "label"} for style in _STYLES.values()
@@ -37,6 +50,10 @@ def write_curves(path: Path, table: Mapping[str, Sequence[float | None]]) -> Non
         for source, style in _STYLES.items():
             curve = info.scale * _curve(table[f"{source}/{info.name}"])
             axis.plot(table["step"], curve, marker=_marker(table), **style)
+        for source, style in _DRAWN_STYLES.items():
+            if f"{source}/{info.name}" in table:
+                curve = info.scale * _curve(table[f"{source}/{info.name}"])
+                axis.plot(table["step"], curve, marker=_marker(table), label=f"{DRAWN[source]}, same renderer", **style)
         axis.set_title(info.label)
     for axis, info in zip(axes[len(images) :], motion, strict=True):
         blind = [other for other in references_of(info) if not other.sees_input]

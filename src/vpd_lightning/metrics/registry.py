@@ -12,6 +12,13 @@ HEADLINE = PSNR
 SOURCES = ("model", "copy_last", "train_mean")
 """Whose images are judged: the model's, and those of two references in its place."""
 REFERENCES = SOURCES[1:]
+NOTHING_MOVES, TRUE_VELOCITY, TRUE_MOTION = "nothing_moves", "constant_velocity", "true_motion"
+DRAWN = {
+    NOTHING_MOVES: "nothing moves",
+    TRUE_VELOCITY: "true velocity kept",
+    TRUE_MOTION: "true motion",
+}
+"""Motions that the model's own renderer draws, where ``protocol.draw_references`` asks for them; and their titles."""
 _BODY = "vpd_lightning.metrics.body_metrics"
 
 METRICS: tuple[MetricInfo, ...] = (
@@ -34,6 +41,12 @@ METRICS: tuple[MetricInfo, ...] = (
         function="vpd_lightning.metrics.flip.flip_of_images", needs_package="flip-evaluator",
         description="how different an image looks from the truth when the two alternate (LDR-FLIP), from 0 to 1, at "
         "67 pixels per degree; measured where the package flip-evaluator is installed",
+    ),
+    MetricInfo(
+        name="moving_iou", title="IoU of changed pixels", unit="", better="higher", digits=3, subject="image",
+        function="vpd_lightning.metrics.moving.iou_of_changed_pixels", needs_motion=True,
+        description="intersection over union of the pixels that differ from the last input frame, as predicted and in "
+        "truth: bodies and shadows where they should be; cameras that stand still",
     ),
     MetricInfo(
         name="sharpness", title="sharpness", unit="", better="one", digits=2, subject="image",

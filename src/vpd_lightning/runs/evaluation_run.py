@@ -55,14 +55,22 @@ def run_evaluation(config: Mapping[str, Any]) -> Path:
     return path
 
 
+_LATER_KEYS = {"draw_references": False}
+"""What protocols of older runs do not say, as they were evaluated."""
+
+
 def choose_protocol(wanted: Mapping[str, Any], run_protocol: Mapping[str, Any] | None) -> Protocol:
     """Return the protocol: what the run's configuration says, with the values that are set replacing its own.
 
     Raises:
         ConfigError: the run has no protocol (an old checkpoint) and none was chosen, or a value is out of range.
     """
-    whole = all(value is not None for key, value in wanted.items() if key != "num_trajectories")
+    may_be_null = ("num_trajectories", *_LATER_KEYS)
+    whole = all(value is not None for key, value in wanted.items() if key not in may_be_null)
     values = dict(wanted) if whole else {**(run_protocol or {}), **{k: v for k, v in wanted.items() if v is not None}}
+    values |= {
+        key: default for key, default in _LATER_KEYS.items() if values.get(key) is None and (whole or run_protocol)
+    }
     missing = [key for key in wanted if key not in values]
     if missing:
         raise ConfigError(f"The run does not say how to evaluate it ({missing[0]} is missing).\nSet protocol=paper.")

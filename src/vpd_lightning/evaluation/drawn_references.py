@@ -1,0 +1,89 @@
+"""Other motions drawn by the model's own renderer: what of a picture's error is motion, and what is drawing."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vpd_lightning.data.clip import Clip
+from vpd_lightning.evaluation.bodies import Body, find_bodies
+from vpd_lightning.evaluation.motion import valid_positions
+from vpd_lightning.evaluation.prediction import PredictsVideo, render_steps, stand_still
+from vpd_lightning.metrics.body_dynamics import best_rotation
+from vpd_lightning.metrics.registry import NOTHING_MOVES, TRUE_MOTION, TRUE_VELOCITY
+from vpd_lightning.simulator import Scene
+from vpd_lightning.types import Particles
+
+
+@torch.no_grad()
+def drawn_references(
+    simulator: PredictsVideo, scene: Scene, clip: Clip, margin: float
+) -> Mapping[str, Float[Tensor, "step view height width 3"]]:
+    """Render the particles of the last input frame as three motions that need no model carry them.
+
+    Nothing moves; bodies keep the true velocity and rotation between the two input frames; bodies move as they truly
+    do, with the features that the dynamics gives them at that step (its shading). The last is about the best that any
+    dynamics can reach with this encoder and this renderer. The clip must have ground truth; a body's particles are
+    those within ``margin`` metres of it. Colours are in [0, 1].
+    """
+    num_steps = clip.target_rgb.shape[0]
+    current = scene.current
+    bodies = find_bodies(clip, valid_positions(current), margin, num_steps)
+    moved = {
+        NOTHING_MOVES: [current] * num_steps,
+        TRUE_VELOCITY: _carried(current, bodies, [_kept_velocity(body, num_steps) for body in bodies], num_steps),
+        TRUE_MOTION: [
+            replace(state, features=predicted.features)
+            for state, predicted in zip(
+                _carried(current, bodies, [body.true for body in bodies], num_steps),
+                simulator.rollout(scene, num_steps),
+                strict=True,
+            )
+        ],
+    }
+    images = {}
+    for name, states in moved.items():
+        if name == NOTHING_MOVES and stand_still(clip.target_cameras):  # one picture stands for all steps
+            images[name] = render_steps(simulator, states[:1], clip.target_cameras[:1]).float().cpu()
+        else:
+            images[name] = render_steps(simulator, states, clip.target_cameras).float().cpu()
+    return images
+
+
+def _kept_velocity(body: Body, num_steps: int) -> Float[Tensor, "time body_particle 3"]:
+    """Where a body's particles are if its velocity and its rotation between the input frames go on."""
+    now = body.true[0]
+    places = [now]
+    if len(now):
+        rotation = best_rotation(body.before, now[None])[0]
+        center, velocity = now.mean(0), now.mean(0) - body.before.mean(0)
+        arms = now - center
+        for step in range(1, num_steps + 1):
+            arms = arms @ rotation.T
+            places.append(center + step * velocity + arms)
+    else:
+        places = [now] * (num_steps + 1)
+    return torch.stack(places)
+
+
+def _carried(
+    current: Particles, bodies: list[Body], places: list[Float[Tensor, "time body_particle 3"]], num_steps: int
+) -> list[Particles]:
+    """Move the particles of bodies to their places after each step; normals turn as the body does."""
+    rows = current.mask[0].nonzero().flatten().cpu()
+    states = []
+    for step in range(1, num_steps + 1):
+        positions = current.positions.clone()
+        normals = None if current.normals is None else current.normals.clone()
+        for body, path in zip(bodies, places, strict=True):
+            own = rows[body.mask].to(positions.device)
+            if not len(own):
+                continue
+            positions[0, own] = path[step].to(positions)
+            if normals is not None:
+                rotation = best_rotation(path[0], path[step][None])[0].to(normals)
+                normals[0, own] = current.normals[0, own] @ rotation.T  # type: ignore[index]
+        states.append(replace(current, positions=positions, normals=normals))
+    return states
