@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from vpd_lightning.renderer.shadows import Shadows
+from vpd_lightning.renderer.shadows import Shadows, _Beam, _lines_pass_near
 
 
 def shadows(num_lights=3, softness=0.1, share=0.2, seed=0):
@@ -213,3 +213,47 @@ def test_parameters_are_part_of_the_picture_even_where_all_lights_went_out():
 def test_wrong_settings_are_refused(num_lights, softness):
     with pytest.raises(ValueError, match="num_lights must be at least 1 and softness positive"):
         Shadows(num_lights=num_lights, softness=softness)
+
+
+def far_apart(batch=3, num_points=40, seed=0):
+    """Bodies metres apart, more of them than balls that decide which points to look at; one member has none."""
+    generator = torch.Generator().manual_seed(seed)
+    bodies = 6 * torch.rand(batch, 12, 1, 3, generator=generator).double() * torch.tensor([1.0, 1.0, 0.2])
+    occluders = (bodies + 0.3 * torch.rand(batch, 12, 5, 3, generator=generator).double()).flatten(1, 2)
+    mask = torch.rand(batch, 60, generator=generator) > 0.2
+    mask[1] = False
+    below = torch.tensor([1.0, 1.0, 0.0])
+    near = occluders[:, torch.randint(60, (num_points,), generator=generator)] * below
+    anywhere = 8 * torch.rand(batch, num_points, 3, generator=generator).double() * torch.tensor([1.0, 1.0, 0.4])
+    return torch.cat([near, anywhere], dim=1), torch.where(mask[..., None], occluders, torch.nan), mask
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_that_are_left_out_would_have_had_all_the_light(seed):
+    model, (points, occluders, mask) = shadows(share=0.6), far_apart(seed=seed)
+
+    light, expected = model(points, occluders, mask), plain(model, points, occluders, mask)
+
+    torch.testing.assert_close(light, expected, rtol=0, atol=1e-9)
+    assert (expected[0] < 0.9).any() and (expected[0] == 1).all(dim=-1).any()
+    assert (expected[1] == 1).all()
+    with torch.no_grad():
+        for direction, width in zip(model.directions, model.log_softness.exp(), strict=True):
+            beam = _Beam(torch.nn.functional.normalize(direction, dim=0), width)
+            near = _lines_pass_near(points, torch.where(mask[..., None], occluders, 0.0), mask, beam)
+            assert 0 < near[0].float().mean() < 0.9 and not near[1].any()
+
+
+def test_gradients_are_those_of_every_pair(monkeypatch):
+    found = {}
+    for on in ("cpu", "any"):
+        monkeypatch.setattr("vpd_lightning.renderer.shadows.is_traced", lambda on=on: on == "any")
+        model, (points, occluders, mask) = shadows(share=0.6), far_apart()
+        points, occluders = points.requires_grad_(), occluders.requires_grad_()
+        model(points, occluders, mask).square().sum().backward()
+        found[on] = [part.grad for part in (points, occluders, *model.parameters())]
+    for one, other in zip(found["cpu"], found["any"], strict=True):
+        torch.testing.assert_close(
+            one.nan_to_num(0), other.nan_to_num(0), rtol=0, atol=1e-8 * other.abs().nan_to_num(0).max()
+        )
+        assert one.isfinite().all()
