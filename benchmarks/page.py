@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks import page_tables
+from benchmarks import page_tables, picture_tables
 from benchmarks.cards import card
 from benchmarks.figures import content_of, file_of, with_figures
 from benchmarks.measuring import Row
@@ -207,8 +207,10 @@ _OF_RESULTS = (
     "vpd_motion",
 )
 VIEWS |= {name: getattr(page_tables, name) for name in (*_OF_RESULTS, "releases")}
+_OF_PICTURES = ("picture_runs", "picture_horizons")
+VIEWS |= {name: getattr(picture_tables, name) for name in _OF_PICTURES}
 # How a view's file is read, where it is not the result of a suite.
-_READERS: dict[str, Callable[[Path], Any]] = dict.fromkeys(_OF_RESULTS, content_of)
+_READERS: dict[str, Callable[[Path], Any]] = dict.fromkeys((*_OF_RESULTS, *_OF_PICTURES), content_of)
 _READERS |= {"memory": lambda path: json.loads(path.read_text()), "releases": lambda path: None}
 
 

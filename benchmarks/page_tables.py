@@ -119,7 +119,8 @@ def demo(content: Mapping[str, Any], path: Path) -> str:
     motion, long = content["motion"], content["long_rollout"]
     references = content["references"]
     lines = _head(["", "prediction", "last frame repeated", "training mean"], 1)
-    for title, name, digits in (("PSNR (dB)", "psnr", 2), ("PSNR moving (dB)", "psnr_moving", 2), ("SSIM", "ssim", 3)):
+    rows = (("PSNR (dB)", "psnr", 2), ("PSNR moving (dB)", "psnr_moving", 2), ("SSIM", "ssim", 3), ("FLIP", "flip", 3))
+    for title, name, digits in rows:
         values = (content, references["copy_last"], references["train_mean"])
         lines.append(f"| {title} | " + " | ".join(f"{value[name]['mean']:.{digits}f}" for value in values) + " |")
     lines += ["", *_head(["after", "step 1", "step 4", "step 8"], 1)]
