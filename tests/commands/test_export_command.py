@@ -19,7 +19,7 @@ from vpd_lightning.release.release_folder import check_release, sha256
 from vpd_lightning.training.checkpoint_files import write_checkpoint
 from vpd_lightning.types import Rays
 
-RELEASED = Path(__file__).parents[2] / "released" / "mujoco_block_demo"
+RELEASED = Path(__file__).parents[2] / "released" / "mujoco_block_vpd"  # a program has no scenery
 
 
 @pytest.fixture(scope="module")
