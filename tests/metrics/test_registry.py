@@ -13,7 +13,9 @@ from vpd_lightning.metrics.registry import METRICS, metric
 
 SOURCE = Path(vpd_lightning.__file__).parent
 ROOT = Path(__file__).resolve().parents[2]
-PUBLISHED = sorted([*ROOT.glob("released/*/metrics.json"), *ROOT.glob("docs/results/demo_*.json")])
+PUBLISHED = sorted(
+    path for pattern in ("released/*/metrics.json", "docs/results/demo_[rs]e*.json") for path in ROOT.glob(pattern)
+)
 # Files that need one of them for what it means, not to list, print or compare it.
 ON_PURPOSE = {
     "metrics/psnr.py": {"psnr", "psnr_moving"},  # the parts that its functions return
