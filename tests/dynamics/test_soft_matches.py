@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from tests.dynamics.test_first_velocity import surfels
-from vpd_lightning.dynamics.inertial.first_velocity import match, match_confidence, point_spacing
+from vpd_lightning.dynamics.inertial.first_velocity import match, match_confidence
+from vpd_lightning.geometry.spacing import point_spacing
 
 
 def test_the_best_match_of_a_point_is_the_nearest_of_its_colour():

@@ -20,10 +20,11 @@ from vpd_lightning.dynamics.inertial.contact import (
     nearest_static_contacts,
 )
 from vpd_lightning.dynamics.inertial.first_motion import find_first_motion, gather_index, movable, observed, put, take
-from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity, Surfels, point_spacing
+from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity, Surfels
 from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
 from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, fit_twists, rotate, rotation_from_spin
 from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
+from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles
 

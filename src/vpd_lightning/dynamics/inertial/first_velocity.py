@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rigid_fit, rotate, rotation_from_spin, weighted_sum
 from vpd_lightning.geometry.decay import decay
+from vpd_lightning.geometry.spacing import point_spacing
 
 _EVIDENCE = 0.3  # evidence (1: one perfect match) at which the confidence of a match is 0.5
-_NUM_SPACED = 128  # points of which the spacing is measured
 _TOO_FAR = 0.01  # at a lower mean confidence of the matches the pose of the body is not updated
 _NO_MATCH = 0.1  # a body with a lower mean confidence was not seen before: no velocity
 
@@ -147,11 +147,12 @@ class FirstVelocity(nn.Module):
 
     def appearance_cost(self, some: Surfels, target: Surfels) -> Float[Tensor, "batch particle target"]:
         """Return half the squared difference in appearance, in the scales of the match."""
-        difference = chromaticity(some.colors)[:, :, None] - chromaticity(target.colors)[:, None]
-        cost = difference.square().sum(dim=-1) / (2 * self.color_scale**2)
+        cost = _half_squares(
+            chromaticity(some.colors) / self.color_scale, chromaticity(target.colors) / self.color_scale
+        )
         if self.feature_scale is not None:
-            difference = some.features[:, :, None] - target.features[:, None]
-            cost = cost + difference.square().sum(dim=-1) / (2 * self.feature_scale**2)
+            scaled = (some.features / self.feature_scale, target.features / self.feature_scale)
+            cost = cost + _half_squares(*scaled)
         return cost
 
     def _variety(self, colors: Tensor, members: Tensor) -> Float[Tensor, "batch body"]:
@@ -177,11 +178,15 @@ class FirstVelocity(nn.Module):
         at = poses.of(some.positions, members)
         matched, evidence, weights = match(at, target, cost, scales)
         confidences = match_confidence(evidence)
-        # Mean planes, not that of the best match: two points may be equally good, and rounding would choose.
-        normals = weights @ target.normals
+        # Symmetric distance (Rusinkiewicz 2019), ``(target - point) . (normal of one + normal of the other) / 2``:
+        # on a curved surface tangent planes alone lie outside of it, and what is seen from above would seem to fall.
+        # Averaged over the soft match, not of its best point: two may be equally good, and rounding would choose.
+        own = rotate((members[..., None, None] * poses.rotations[:, :, None]).sum(dim=1), some.normals)
+        normals = (weights @ target.normals + own) / 2
         middle = _masked_mean(target.positions, target.mask)
         heights = weights @ ((target.positions - middle) * target.normals).sum(dim=-1, keepdim=True)
-        off_plane = heights.squeeze(-1) - ((at - middle) * normals).sum(dim=-1)
+        heights = (heights.squeeze(-1) + ((matched - middle) * own).sum(dim=-1)) / 2
+        off_plane = heights - ((at - middle) * normals).sum(dim=-1)
         # A point whose plane is far off has no match there, whatever the soft match is (Geman-McClure weights).
         robust_weights = 1 / (1 + (off_plane.detach() / smallest.clamp(min=1e-9)).square())
         plane_weights = confidences * robust_weights * (normals.square().sum(dim=-1) > 0.5)
@@ -215,6 +220,16 @@ class FirstVelocity(nn.Module):
 def chromaticity(colors: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 6"]:
     """Return what is compared of colours: shares of red, green and blue, and, more weakly, brightness."""
     return torch.cat([colors / (colors.sum(dim=-1, keepdim=True) + 0.15), 0.3 * colors], dim=-1)
+
+
+def _half_squares(
+    some: Float[Tensor, "batch particle value"], target: Float[Tensor, "batch target value"]
+) -> Float[Tensor, "batch particle target"]:
+    """Return half the squared distance of every pair, as a product: five times as fast as from differences."""
+    middle = target.mean(dim=1, keepdim=True).detach()  # about which large features keep their digits
+    some, target = some - middle, target - middle
+    square = torch.baddbmm(target.square().sum(dim=-1)[:, None], some, target.mT, alpha=-2)
+    return 0.5 * (square + some.square().sum(dim=-1)[..., None]).clamp(min=0)
 
 
 def match(
@@ -277,14 +292,3 @@ def body_radii(positions: Tensor, members: Tensor) -> Float[Tensor, "batch body"
     weights = members / members.sum(dim=2, keepdim=True).clamp(min=1)
     offsets = positions[:, None] - weighted_sum(weights, positions)[:, :, None]
     return (weights * offsets.square().sum(dim=-1)).sum(dim=2).clamp(min=1e-18).sqrt()
-
-
-def point_spacing(positions: Tensor, mask: Tensor) -> Float[Tensor, " batch"]:
-    """Return the median distance (metres) of the first points to their fourth nearest, as in ``graph.bodies``."""
-    some, valid = positions[:, :_NUM_SPACED], mask[:, :_NUM_SPACED]
-    both = valid[:, :, None] & mask[:, None]
-    square = (some[:, :, None] - positions[:, None]).square().sum(dim=-1).masked_fill(~both, torch.inf)
-    rank = min(5, positions.shape[1])  # itself is the nearest
-    distances = square.topk(rank, dim=-1, largest=False).values[..., -1].sqrt()
-    usable = torch.where(valid & torch.isfinite(distances), distances, torch.nan)
-    return torch.nan_to_num(usable.nanmedian(dim=1).values, nan=0.0)
