@@ -15,10 +15,11 @@ def shadows(num_lights=3, softness=0.1, share=0.2, seed=0):
         model.directions += 0.3 * torch.randn(num_lights, 3, generator=generator)
         model.shares.copy_(share * (1.3 * torch.rand(num_lights, 3, generator=generator) - 0.3))
         model.log_softness += 0.3 * torch.randn(num_lights, generator=generator)
+        model.log_slope += 2 + 0.3 * torch.randn(num_lights, generator=generator)
     return model
 
 
-def scene(batch=2, num_points=9, num_occluders=7, seed=0):
+def scene(batch=2, num_points=9, num_occluders=11, seed=0):
     """Points on the floor and occluders up to half a metre above it, a third of them padding with junk."""
     generator = torch.Generator().manual_seed(seed)
     points = torch.rand(batch, num_points, 3, generator=generator).double() * torch.tensor([1.0, 1.0, 0.05])
@@ -27,23 +28,35 @@ def scene(batch=2, num_points=9, num_occluders=7, seed=0):
     return points, torch.where(mask[..., None], occluders, 30.0), mask
 
 
+OPACITY = 2.0  # of a closed, level sheet of points
+
+
+def area_of_one(occluders):
+    """The area that each of these points stands for: a circle that holds four has the radius of the fourth nearest."""
+    gaps = np.sort(np.linalg.norm(occluders[:, None] - occluders, axis=-1), axis=1)
+    return math.pi * np.sort(gaps[:, 4])[(len(gaps) - 1) // 2] ** 2 / 4 if len(gaps) > 4 else None
+
+
 def plain(model, points, occluders, mask):
     """Every light, point and occluder in turn, by the words of the class. NumPy, float64."""
-    directions = model.directions.detach().numpy()
-    shares, widths = model.shares.detach().numpy(), model.log_softness.detach().exp().numpy()
+    weights = {name: value.detach().numpy() for name, value in model.named_parameters()}
+    widths, slopes = (np.exp(weights[f"log_{name}"]) for name in ("softness", "slope"))
     light = np.ones(points.shape)
     for member in range(len(points)):
+        casting = occluders[member][mask[member]].numpy()
+        area = area_of_one(casting)
         for i, point in enumerate(points[member].numpy()):
-            for direction, share, width in zip(directions, shares, widths, strict=True):
+            for number, direction in enumerate(weights["directions"]):
                 direction = direction / np.linalg.norm(direction)
                 blocked = 0.0
-                for occluder, there in zip(occluders[member].numpy(), mask[member].numpy(), strict=True):
-                    if there:
-                        towards = float((occluder - point) @ direction)
-                        beside = float(np.linalg.norm(np.cross(occluder - point, direction)))
-                        ahead = 1 / (1 + math.exp(2 - towards / (0.5 * width)))
-                        blocked += math.exp(-(beside**2) / (2 * width**2)) * ahead
-                light[member, i] -= np.maximum(share, 0) * (1 - math.exp(-blocked))
+                for occluder in casting:
+                    towards = float((occluder - point) @ direction)
+                    beside = float(np.linalg.norm(np.cross(occluder - point, direction)))
+                    ahead = 1 / (1 + math.exp(2 - towards / (0.5 * widths[number])))
+                    square = widths[number] ** 2 + (slopes[number] * towards) ** 2
+                    share = widths[number] ** 2 / square if area is None else area / (2 * math.pi * square)
+                    blocked += OPACITY * share * math.exp(-(beside**2) / (2 * square)) * ahead
+                light[member, i] -= np.maximum(weights["shares"][number], 0) * (1 - math.exp(-blocked))
     return torch.from_numpy(np.maximum(light, 0.05))
 
 
@@ -61,9 +74,42 @@ def test_a_point_above_all_else_has_all_the_light():
     model, (points, occluders, _) = shadows(), scene()
 
     none = model(points, occluders[:, :0], torch.zeros(2, 0, dtype=torch.bool))
-    masked = model(points, occluders, torch.zeros(2, 7, dtype=torch.bool))
+    masked = model(points, occluders, torch.zeros(2, 11, dtype=torch.bool))
 
     assert torch.equal(none, torch.ones_like(points)) and torch.equal(masked, torch.ones_like(points))
+
+
+def test_a_shadow_is_as_dense_whatever_the_number_of_points():
+    model = Shadows(num_lights=1, softness=0.02).double()  # straight up
+    points = torch.tensor([[[0.0, 0.0, 0.0], [0.05, 0.02, 0.0], [0.2, 0.0, 0.0]]]).double()
+    light = [
+        model(points, disc([0.0, 0.0, 0.3], count=count)[None], torch.ones(1, count, dtype=torch.bool))
+        for count in (100, 400)
+    ]
+
+    torch.testing.assert_close(light[0], light[1], rtol=0, atol=3e-3)
+    assert light[0][0, :2].max() < 0.92 and light[0][0, 2].min() > 0.999
+
+
+@pytest.mark.parametrize("slope", [0.05, 0.2])
+def test_the_edge_of_a_shadow_is_wider_the_higher_the_body_is(slope, monkeypatch):
+    """Across the edge of a half plane, Gaussians of equal density add up to the normal distribution."""
+    # So thin that light falls in proportion.
+    monkeypatch.setattr("vpd_lightning.renderer.shadows._OPACITY", 0.01)
+    model = Shadows(num_lights=1, softness=0.01).double()
+    with torch.no_grad():
+        model.log_slope.fill_(math.log(slope))
+        model.shares.fill_(1.0)
+    step = 0.008
+    grid = torch.cartesian_prod(step * (torch.arange(75) + 0.5), step * (torch.arange(151) - 75.0)).double()
+    for height in (0.2, 0.6):
+        sheet = torch.cat([grid, torch.full((len(grid), 1), height).double()], dim=1)[None]
+        line = torch.zeros(1, 9, 3).double()
+        line[0, :, 0] = torch.linspace(-0.1, 0.2, 9)
+        dark = 1 - model(line, sheet, torch.ones(sheet.shape[:2], dtype=torch.bool))[0, :, 0]
+        width = math.hypot(0.01, slope * height)
+        expected = torch.special.ndtr(line[0, :, 0] / width)
+        torch.testing.assert_close(dark / dark[-1], expected / expected[-1], rtol=0, atol=0.02)
 
 
 def test_masked_occluders_cast_nothing():
@@ -123,7 +169,7 @@ def test_lights_without_a_share_do_nothing():
         model.shares[1] = torch.tensor([-0.3, 0.0, -0.1])
     fewer = Shadows(num_lights=2, softness=0.1).double()
     with torch.no_grad():
-        for name in ("directions", "shares", "log_softness"):
+        for name, _ in fewer.named_parameters():
             getattr(fewer, name).copy_(getattr(model, name)[[0, 2]])
 
     torch.testing.assert_close(
@@ -231,6 +277,7 @@ def far_apart(batch=3, num_points=40, seed=0):
 @pytest.mark.parametrize("seed", range(3))
 def test_points_that_are_left_out_would_have_had_all_the_light(seed):
     model, (points, occluders, mask) = shadows(share=0.6), far_apart(seed=seed)
+    model.log_slope.data -= 2.0
 
     light, expected = model(points, occluders, mask), plain(model, points, occluders, mask)
 
@@ -238,8 +285,9 @@ def test_points_that_are_left_out_would_have_had_all_the_light(seed):
     assert (expected[0] < 0.9).any() and (expected[0] == 1).all(dim=-1).any()
     assert (expected[1] == 1).all()
     with torch.no_grad():
-        for direction, width in zip(model.directions, model.log_softness.exp(), strict=True):
-            beam = _Beam(torch.nn.functional.normalize(direction, dim=0), width)
+        lights = zip(model.directions, model.log_softness.exp(), model.log_slope.exp(), strict=True)
+        for direction, width, slope in lights:
+            beam = _Beam(torch.nn.functional.normalize(direction, dim=0), width, slope)
             near = _lines_pass_near(points, torch.where(mask[..., None], occluders, 0.0), mask, beam)
             assert 0 < near[0].float().mean() < 0.9 and not near[1].any()
 

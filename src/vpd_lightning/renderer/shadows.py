@@ -9,16 +9,24 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from vpd_lightning.geometry.decay import NEGLIGIBLE, decay
+from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.types import is_traced
 
 _POINTS_PER_CHUNK = 256
 """Points at a time: with 512 occluders half a megabyte, which stays in cache."""
 
-_REACH = 7.0
-"""Widths beside an occluder from which on it casts nothing: e^-24 of what it casts where it is."""
+_REACH = 6.0
+"""Widths beside an occluder from which on it casts nothing: e^-18 of what it casts where it is."""
 
 _REACH_ALONG = 13.0
 """Widths below a point, along the light, from which on an occluder casts nothing: the logistic's e^-26 there."""
+
+_OPACITY = 2.0
+"""Of a level sheet of points: e^-2 of the light gets through. Learned, it fell to 0.8 while the direction was still
+wrong and stayed there, with wide and pale shadows; set to 2 afterwards these were sharper and darker and right."""
+
+_BEGIN = 2.0
+"""Half widths above a point at which an occluder begins to count: what touches the point is its own surface."""
 
 _POINTS_PER_BLOCK = 16384
 """Points at a time where all pairs are computed, without gradients: 32 MB with 512 occluders."""
@@ -30,9 +38,12 @@ _NUM_BALLS = 8
 class Shadows(nn.Module):
     """How much light reaches a point past the bodies, from ``num_lights`` lights far away.
 
-    A point of a body that lies within about ``softness`` (metres, learned) of the line to a light keeps that light
-    away. Each light has a learned direction and a learned share of the light per colour channel. Directions start
-    spread over the upper half; pixels decide which of them cast shadows.
+    Each point of a body stands for as much of its surface as lies between it and its neighbours, and keeps light away
+    within about ``softness`` (metres, learned) of its line to the light; the higher it is, the wider, as below a light
+    of some size (the tangent of half its angle is learned, a penumbra's slope). How dense a shadow is does not depend
+    on how many points there are, nor on the width of its edge. Each light has a learned direction and a learned share
+    of the light per colour channel. Directions start spread over the upper half; pixels decide which of them cast
+    shadows.
     """
 
     # Paper: has no shadows of its own; the radiance field paints what its particles' features say.
@@ -45,6 +56,7 @@ class Shadows(nn.Module):
         # Together a tenth of the light before training.
         self.shares = nn.Parameter(torch.full((num_lights, 3), 0.1 / num_lights))
         self.log_softness = nn.Parameter(torch.full((num_lights,), softness).log())
+        self.log_slope = nn.Parameter(torch.full((num_lights,), 0.03).log())
 
     def forward(
         self,
@@ -60,27 +72,46 @@ class Shadows(nn.Module):
         center = torch.where(mask[..., None], occluders, 0.0).sum(dim=1, keepdim=True) / count
         points, occluders = points - center, torch.where(mask[..., None], occluders - center, 0.0)
         directions = nn.functional.normalize(self.directions, dim=-1).to(points.dtype)
+        spacing = point_spacing(occluders.detach(), mask)
         # Never less than no light; the gradient goes through, so that a light that went out may come back.
         shares = self.shares + (self.shares.clamp(min=0) - self.shares).detach()
         lit = range(len(shares)) if torch.is_grad_enabled() else (shares > 0).any(dim=1).nonzero().flatten().tolist()
         light = torch.ones_like(points)
         for i in lit:
-            beam = _Beam(directions[i], self.log_softness[i].exp())
+            beam = _Beam(directions[i], self.log_softness[i].exp(), self.log_slope[i].exp())
+            density = _OPACITY * beam.share_of_width(spacing)
             if points.device.type == "cpu" and not is_traced():
-                kept_away = 1 - decay(-_met_near(points, occluders, mask, beam))
+                met = _met_near(points, occluders, mask, beam)
             else:
                 keeps_all = torch.is_grad_enabled() or is_traced()
                 parts = [points] if keeps_all else points.split(_POINTS_PER_BLOCK, dim=1)
-                kept_away = torch.cat([1 - decay(-_met(part, occluders, mask, beam)) for part in parts], dim=1)
-            light = light - shares[i] * kept_away[..., None]
+                met = torch.cat([_met(part, occluders, mask, beam) for part in parts], dim=1)
+            light = light - shares[i] * (1 - decay(-density[:, None] * met))[..., None]
         return light.clamp(min=0.05)
 
 
 class _Beam(NamedTuple):
-    """Parallel light: the unit direction towards it, and how far beside a line to it an occluder still casts (m)."""
+    """Light from one side: the unit direction towards it, and how far beside a line to it an occluder casts.
+
+    That is ``width`` (metres) at the occluder, and for each metre below it ``slope`` more, in squares.
+    """
 
     direction: Float[Tensor, " 3"]
     width: Float[Tensor, ""]
+    slope: Float[Tensor, ""]
+
+    @property
+    def growth(self) -> Float[Tensor, ""]:
+        """How much the squared width grows, in squared widths, from one half width below the occluder to the next."""
+        return (0.5 * self.slope).square()
+
+    def share_of_width(self, spacing: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
+        """Return the area that a point stands for, over that of the Gaussian of its width: their sum is then a density.
+
+        The fourth of evenly scattered neighbours lies where a circle holds four (``point_spacing``). Where points are
+        too few for a spacing, each counts once.
+        """
+        return torch.where(spacing > 0, spacing.square() / (8 * self.width.square()), 1.0)
 
     def coordinates(
         self, points: Float[Tensor, "batch point 3"], occluders: Float[Tensor, "batch occluder 3"]
@@ -92,8 +123,8 @@ class _Beam(NamedTuple):
     ]:
         """Return rows and columns whose product is minus half the squared distance of a pair across the light.
 
-        In widths; and where points and occluders are along the light, in half widths: what touches a point is its own
-        surface, what is below it does not cast, so an occluder begins to count two of these above it.
+        In widths; and where points and occluders are along the light, in half widths. What is below a point does not
+        cast on it.
         """
         axes = _across(self.direction) / (math.sqrt(2) * self.width)
         seen, casting = points @ axes.mT, occluders @ axes.mT
@@ -101,37 +132,51 @@ class _Beam(NamedTuple):
         rows = torch.cat([2 * seen, -seen.square().sum(-1, keepdim=True), one], dim=-1)
         columns = torch.cat([casting, other, -casting.square().sum(-1, keepdim=True)], dim=-1)
         along = self.direction / (0.5 * self.width)
-        return rows, columns, points @ along, occluders @ along - 2.0
+        return rows, columns, points @ along, occluders @ along - _BEGIN
 
 
 def _met(points: Tensor, occluders: Tensor, mask: Tensor, beam: _Beam) -> Float[Tensor, "batch point"]:
     """Return how many occluders each point meets on its way to the light, from every pair."""
     rows, columns, starts, ends = beam.coordinates(points, occluders)
-    met = decay((rows @ columns.mT).clamp(max=0)) * torch.sigmoid(ends[..., None, :] - starts[..., None])
+    offsets = ends[..., None, :] - starts[..., None]
+    narrow = 1 / (1 + beam.growth * (offsets + _BEGIN).square())
+    met = narrow * decay((rows @ columns.mT).clamp(max=0) * narrow) * torch.sigmoid(offsets)
     return (met * mask[..., None, :]).sum(dim=-1)
 
 
 class _SoftCount(torch.autograd.Function):
-    """How many occluders stand between each point and the light: ``sum_o exp(rows @ columns) sigmoid(end - start)``.
+    """How many occluders stand between each point and the light, as in ``_met``, without a mask.
 
-    It keeps two numbers of each pair, and its backward pass is two matrix products: half of the time that autograd
+    With ``t = end - start`` and ``n = 1 / (1 + growth (t + 2)^2)`` it is ``sum_o n exp(n rows @ columns) sigmoid(t)``.
+    It keeps three numbers of each pair, and its backward pass is two matrix products: half of the time that autograd
     takes for the same sum. It has first derivatives alone.
     """
 
     @staticmethod
-    def forward(ctx: Any, rows: Tensor, columns: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-        ahead = torch.sigmoid(ends - starts[:, None])
-        met = (rows @ columns.mT).clamp_(min=NEGLIGIBLE, max=0).exp_().mul_(ahead)
-        ctx.save_for_backward(rows, columns, met, ahead)
+    def forward(ctx: Any, rows: Tensor, columns: Tensor, starts: Tensor, ends: Tensor, growth: Tensor) -> Tensor:
+        offsets = ends - starts[:, None]
+        ahead = torch.sigmoid(offsets)
+        square = offsets.add_(_BEGIN).square_()
+        narrow = square.mul_(growth).add_(1).reciprocal_()
+        exponents = (rows @ columns.mT).clamp_(max=0).mul_(narrow).clamp_(min=NEGLIGIBLE)
+        met = exponents.exp().mul_(ahead).mul_(narrow)
+        ctx.save_for_backward(rows, columns, starts, ends, growth, met, exponents, ahead, narrow)
         return met.sum(dim=-1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, ...]:
-        rows, columns, met, ahead = ctx.saved_tensors
-        by_exponent = met * gradients[0][:, None]
-        by_offset = by_exponent - by_exponent * ahead
-        return by_exponent @ columns, by_exponent.mT @ rows, -by_offset.sum(dim=1), by_offset.sum(dim=0)
+        rows, columns, starts, ends, growth, met, exponents, ahead, narrow = ctx.saved_tensors
+        by_log = met * gradients[0][:, None]
+        by_exponent = by_log * narrow
+        # n = 1 / (1 + growth x^2): of log(n) + n q the derivative by log(n) is 1 + n q, that of log(n) by x is
+        # -2 growth x n, and by growth -x^2 n.
+        by_narrow = (exponents + 1).mul_(by_exponent)
+        height = ends + _BEGIN - starts[:, None]
+        by_narrow.mul_(height)
+        by_offset = by_log.sub_(by_log * ahead).sub_(by_narrow * (2 * growth))
+        by_growth = -by_narrow.mul_(height).sum()
+        return by_exponent @ columns, by_exponent.mT @ rows, -by_offset.sum(dim=1), by_offset.sum(dim=0), by_growth
 
 
 def _across(direction: Float[Tensor, " 3"]) -> Float[Tensor, "2 3"]:
@@ -155,10 +200,11 @@ def _met_near(
         casting = slice(None) if bool(mask[member].all()) else mask[member]
         for some in place.split(_POINTS_PER_CHUNK):
             chosen = rows[member].index_select(0, some), columns[member][casting]
-            found.append(_SoftCount.apply(*chosen, starts[member].index_select(0, some), ends[member][casting]))
+            begin, end = starts[member].index_select(0, some), ends[member][casting]
+            found.append(_SoftCount.apply(*chosen, begin, end, beam.growth))
         places.append(place + member * points.shape[1])
     # Without a point near, each weight has a gradient all the same, as training on several devices needs.
-    met = (0 * (beam.direction.sum() + beam.width)).expand(near.numel())
+    met = (0 * (beam.direction.sum() + beam.width + beam.slope)).expand(near.numel())
     if found:
         met = met.index_add(0, torch.cat(places), torch.cat(found).to(met))
     return met.unflatten(0, points.shape[:2])
@@ -168,10 +214,11 @@ def _met_near(
 def _lines_pass_near(points: Tensor, occluders: Tensor, mask: Tensor, beam: _Beam) -> Bool[Tensor, "batch point"]:
     """Return whose lines to the light pass within ``_REACH`` widths of one of ``_NUM_BALLS`` balls around occluders."""
     centers, radii = _balls(occluders, mask)
-    reach = (radii + _REACH * beam.width)[:, None]
-    below = (radii + _REACH_ALONG * beam.width)[:, None]
+    radii = radii[:, None]
     square = points.square().sum(-1, keepdim=True) + centers.square().sum(-1)[:, None] - 2 * points @ centers.mT
     towards = (centers @ beam.direction)[:, None] - (points @ beam.direction)[..., None]
+    reach = radii + _REACH * (beam.width + beam.slope * (towards + radii).clamp(min=0))
+    below = radii + _REACH_ALONG * beam.width
     # What is not a number is near everything, so that it stays what it is.
     return ~((square - towards.square() > reach.square()) | (towards < -below)).all(dim=-1)
 
