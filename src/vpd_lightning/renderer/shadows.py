@@ -148,7 +148,7 @@ class _SoftCount(torch.autograd.Function):
     """How many occluders stand between each point and the light, as in ``_met``, without a mask.
 
     With ``t = end - start`` and ``n = 1 / (1 + growth (t + 2)^2)`` it is ``sum_o n exp(n rows @ columns) sigmoid(t)``.
-    It keeps three numbers of each pair, and its backward pass is two matrix products: half of the time that autograd
+    It keeps four numbers of each pair, and its backward pass is two matrix products: half of the time that autograd
     takes for the same sum. It has first derivatives alone.
     """
 
