@@ -207,7 +207,7 @@ _OF_RESULTS = (
     "vpd_motion",
 )
 VIEWS |= {name: getattr(page_tables, name) for name in (*_OF_RESULTS, "releases")}
-_OF_PICTURES = ("picture_runs", "picture_horizons")
+_OF_PICTURES = ("picture_runs", "picture_sets", "picture_horizons")
 VIEWS |= {name: getattr(picture_tables, name) for name in _OF_PICTURES}
 # How a view's file is read, where it is not the result of a suite.
 _READERS: dict[str, Callable[[Path], Any]] = dict.fromkeys((*_OF_RESULTS, *_OF_PICTURES), content_of)

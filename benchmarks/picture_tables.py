@@ -1,6 +1,6 @@
 """Tables of predicted pictures, from what ``docs.results.studies.pictures`` wrote."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,31 +18,55 @@ _SCORES = ("psnr", "psnr_moving", "ssim", "flip", "moving_iou")
 
 def picture_runs(content: Mapping[str, Any], path: Path) -> str:
     """One row for each evaluation: means of all scores, the last input frame rendered again, centroids by step."""
-    first = next(iter(content.values()))
-    steps = list(first["pictures"]["prediction"]["psnr"]["per_step"])
-    again = ["last frame again (dB)", "SSIM of it"]
-    lines = _head(["", *(metric(name).label for name in _SCORES), *again, *(f"centroid {step} (cm)" for step in steps)])
+    return "\n".join([*_head(["", *_run_titles(content)]), *(_row(name, cells) for name, cells in _run_rows(content))])
+
+
+def picture_sets(content: Mapping[str, Any], path: Path) -> str:
+    """As ``picture_runs`` for several data sets below each other; evaluations are named ``DATA SET: MODEL``."""
+    sets: dict[str, dict[str, Any]] = {}
     for name, row in content.items():
-        cells = [_shown(row["pictures"]["prediction"], score) for score in _SCORES]
-        cells += [f"{row['reconstruction'][score]:.{digits}f}" for score, digits in (("psnr", 1), ("ssim", 3))]
+        data_set, _, model = name.partition(": ")
+        sets.setdefault(data_set, {})[model] = row
+    lines = _head(["", "", *_run_titles(content)], 2)
+    for data_set, rows in sets.items():
+        for number, (name, cells) in enumerate(_run_rows(rows)):
+            lines.append(_row("" if number else data_set, [name, *cells]))
+    return "\n".join(lines)
+
+
+def _steps(content: Mapping[str, Any]) -> list[str]:
+    return list(next(iter(content.values()))["pictures"]["prediction"]["psnr"]["per_step"])
+
+
+def _run_titles(content: Mapping[str, Any]) -> list[str]:
+    again = ["last frame again (dB)", "SSIM of it"]
+    return [*(metric(name).label for name in _SCORES), *again, *(f"centroid {step} (cm)" for step in _steps(content))]
+
+
+def _run_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
+    """Yield name and cells of each evaluation, then of what needs no model: on the same data it is the same of all."""
+    steps = _steps(content)
+    for name, row in content.items():
+        again = [f"{row['reconstruction'][score]:.{digits}f}" for score, digits in (("psnr", 1), ("ssim", 3))]
         centroid = row["centroid_error"].get("prediction", {})
-        lines.append(_row(name, [*cells, *(_centimetres(centroid.get(step)) for step in steps)]))
+        shown = [_shown(row["pictures"]["prediction"], score) for score in _SCORES]
+        yield name, [*shown, *again, *(_centimetres(centroid.get(step)) for step in steps)]
+    first = next(iter(content.values()))
     for source in list(_TITLES)[1:]:
         # Of other motions each model draws its own picture: what is known of them is shown by horizon.
         pictures = first["pictures"].get(source, {}) if source in ("copy_last", "train_mean") else {}
         centroid = first["centroid_error"].get(source, {})
         if pictures or centroid:
-            cells = [_shown(pictures, score) for score in _SCORES]
-            cells += ["", "", *(_centimetres(centroid.get(step)) for step in steps)]
-            lines.append(_row(_TITLES[source].replace(", same renderer", ""), cells))
-    return "\n".join(lines)
+            shown = [_shown(pictures, score) for score in _SCORES]
+            cells = [*shown, "", "", *(_centimetres(centroid.get(step)) for step in steps)]
+            yield _TITLES[source].replace(", same renderer", ""), cells
 
 
 def picture_horizons(content: Mapping[str, Any], path: Path) -> str:
     """Each score after some steps, for the first evaluation and all that it is compared with."""
     row = next(iter(content.values()))
     pictures = row["pictures"]
-    steps = list(pictures["prediction"]["psnr"]["per_step"])
+    steps = _steps(content)
     lines = _head(["", "", "mean", *(f"step {step}" for step in steps)], 2)
     for score in _SCORES:
         if score not in pictures["prediction"]:

@@ -70,3 +70,24 @@ def test_a_score_that_one_of_them_lacks_is_left_empty(tmp_path: Path) -> None:
     pictures.main([str(out), f"seed 0={tmp_path / 'new'}"])
     runs = picture_tables.picture_runs(json.loads(out.read_text()), out).splitlines()
     assert runs[4] == "| *mean image* | 0.20 | 0.20 | 0.200 |  | 0.200 |  |  |  |  |  |"
+
+
+def test_data_sets_stand_below_each_other_with_their_own_references(tmp_path: Path) -> None:
+    write_metrics(tmp_path / "new", 0.5, drawn=False)
+    write_metrics(tmp_path / "old", 0.4, drawn=False)
+    out = tmp_path / "out.json"
+    names = [("block: new", "new"), ("block: old", "old"), ("ball: new", "new")]
+    pictures.main([str(out), *(f"{name}={tmp_path / folder}" for name, folder in names)])
+    lines = picture_tables.picture_sets(json.loads(out.read_text()), out).splitlines()
+    assert [line.split(" | ")[:2] for line in lines[2:]] == [
+        ["| block", "new"],
+        ["| ", "old"],
+        ["| ", "*last frame*"],
+        ["| ", "*mean image*"],
+        ["| ", "*best constant*"],
+        ["| ball", "new"],
+        ["| ", "*last frame*"],
+        ["| ", "*mean image*"],
+        ["| ", "*best constant*"],
+    ]
+    assert len({line.count("|") for line in lines}) == 1
