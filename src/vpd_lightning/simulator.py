@@ -18,6 +18,7 @@ from vpd_lightning.system import AbstractSystem
 from vpd_lightning.types import (
     NUM_CONTEXT_FRAMES,
     Cameras,
+    Occluders,
     Particles,
     Rays,
     RenderedRays,
@@ -102,9 +103,12 @@ class Simulator(AbstractSystem):
         num_steps = batch.rays.origins.shape[1]
         states = self.unroll(previous.particles, current.particles, num_steps, batch.keys)
         shown = [self._shown(state) for state in states]
-        rendered = self._render_steps(shown, batch.rays, batch.keys if self.training else None)
+        observed = self._observed(batch)
+        # The light is learned from shadows of what is seen later: those of bodies in the wrong place would mislead it.
+        casting = _occluders(observed) if self.training else None
+        rendered = self._render_steps(shown, batch.rays, batch.keys if self.training else None, casting)
         before = {f"previous_{name}": value for name, value in previous.auxiliary.items()}
-        return SimulatorOutput(rendered, states, current.auxiliary | before | self._observed(batch))
+        return SimulatorOutput(rendered, states, current.auxiliary | before | observed)
 
     def _shown(self, state: Particles) -> Particles:
         """Return a state whose positions get their share of the gradient of what is rendered."""
@@ -146,7 +150,9 @@ class Simulator(AbstractSystem):
         noise = torch.stack([torch.randn(shape, generator=g) for g in keys.generators(f"noise/{rollout_step}")])
         return replace(particles, positions=particles.positions + self.location_noise * noise.to(particles.positions))
 
-    def _render_steps(self, states: Sequence[Particles], rays: Rays, keys: RandomKeys | None) -> RenderedRays:
+    def _render_steps(
+        self, states: Sequence[Particles], rays: Rays, keys: RandomKeys | None, occluders: Occluders | None = None
+    ) -> RenderedRays:
         """Render ``batch time ray`` rays of a list of states as one batch of ``batch * time`` scenes."""
         batch_size, num_steps = rays.origins.shape[:2]
 
@@ -160,6 +166,7 @@ class Simulator(AbstractSystem):
             moving=None if states[0].moving is None else flatten([s.moving for s in states]),  # type: ignore[misc]
             normals=None if states[0].normals is None else flatten([s.normals for s in states]),  # type: ignore[misc]
             scenery=states[0].scenery,
+            occluders=occluders,
         )
         flat_rays = Rays(rays.origins.flatten(0, 1), rays.directions.flatten(0, 1))
         if keys is not None:  # one set of draws per (member, step); steps stay apart for up to a million steps
@@ -247,3 +254,10 @@ class Simulator(AbstractSystem):
             depths=torch.stack([image.depths[0].reshape(shape) for image in images]),
             opacities=torch.stack([image.opacities[0].reshape(shape) for image in images]),
         )
+
+
+def _occluders(observed: dict[str, Tensor]) -> Occluders | None:
+    """Return what was seen to move at each predicted step, axes ``batch * time``."""
+    if "future_positions" not in observed:
+        return None
+    return Occluders(observed["future_positions"].flatten(0, 1), observed["future_mask"].flatten(0, 1))

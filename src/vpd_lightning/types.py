@@ -101,12 +101,21 @@ class Scenery(_Border):
 
 
 @dataclass(frozen=True)
+class Occluders(_Border):
+    """Points (metres) that cast shadows on the scenery; ``mask`` is false for padding."""
+
+    positions: Float[Tensor, "*batch occluder 3"]
+    mask: Bool[Tensor, "*batch occluder"]
+
+
+@dataclass(frozen=True)
 class Particles(_Border):
     """Latent particles, dense and padded; ``mask`` is false for padding. The batch axis may be absent.
 
     ``colors`` (observed RGB in [0, 1]), ``moving`` (may belong to something that moves) and ``normals`` (unit, zero
     where unknown) are observations carried along for a dynamics that uses them; the paper's does not. With ``scenery``
     particles that are not ``moving`` are for the dynamics alone: a renderer draws the scenery in their place.
+    ``occluders`` cast the shadows in place of moving particles: in training, what was seen to move at that time.
     """
 
     positions: Float[Tensor, "*batch particle 3"]
@@ -116,6 +125,7 @@ class Particles(_Border):
     moving: Bool[Tensor, "*batch particle"] | None = None
     normals: Float[Tensor, "*batch particle 3"] | None = None
     scenery: Scenery | None = None
+    occluders: Occluders | None = None
 
     def __post_init__(self) -> None:
         if self.mask is None:
@@ -127,8 +137,8 @@ class Particles(_Border):
         return self.positions.shape[-2]
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> "Particles":
-        """Apply a function to every tensor with a particle axis; the scenery stays."""
-        names = [item.name for item in fields(self) if item.name != "scenery"]
+        """Apply a function to every tensor with a particle axis; the scenery and occluders stay."""
+        names = [item.name for item in fields(self) if item.name not in ("scenery", "occluders")]
         known = {name: value for name in names if (value := getattr(self, name)) is not None}
         return replace(self, **{name: function(value) for name, value in known.items()})
 

@@ -11,11 +11,16 @@ _NUM_OCCLUDERS = 512
 
 
 def occluders_of(particles: Particles) -> tuple[Float[Tensor, "batch occluder 3"], Bool[Tensor, "batch occluder"]]:
-    """Return places (metres) of moving particles, and which of them there are; evenly spread over their slots.
+    """Return places (metres) of what casts shadows, and which of them there are; evenly spread over their slots.
 
-    Slots are in random order but after edits, where what was added comes last and casts shadows as well.
+    Those are the particles' ``occluders`` where they have some, otherwise the moving ones. Slots are in random order
+    but after edits, where what was added comes last and casts shadows as well.
     """
-    mask = particles.mask if particles.moving is None else particles.mask & particles.moving
+    positions, mask = particles.positions, particles.mask
+    if particles.occluders is not None:
+        positions, mask = particles.occluders.positions, particles.occluders.mask
+    elif particles.moving is not None:
+        mask = mask & particles.moving
     counts = mask.sum(dim=1)
     num = min(_NUM_OCCLUDERS, int(counts.max()) if mask.numel() else 0)
     ordinal = torch.arange(num, device=mask.device)
@@ -23,6 +28,6 @@ def occluders_of(particles: Particles) -> tuple[Float[Tensor, "batch occluder 3"
     index = torch.sort((~mask).to(torch.uint8), dim=1, stable=True).indices.gather(
         1, ranks.clamp(max=mask.shape[1] - 1)
     )
-    positions = torch.gather(particles.positions, 1, index[..., None].expand(-1, -1, 3))
+    places = torch.gather(positions, 1, index[..., None].expand(-1, -1, 3))
     there = torch.gather(mask, 1, index) & (ordinal < counts[:, None])
-    return torch.where(there[..., None], positions, 0.0), there
+    return torch.where(there[..., None], places, 0.0), there

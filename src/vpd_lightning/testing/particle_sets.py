@@ -75,7 +75,7 @@ def padded_inside(particles: Particles) -> Particles:
         values = [getattr(part, name) for part in parts]
         return None if values[0] is None else torch.cat(values, dim=1)
 
-    names = [item.name for item in fields(Particles) if item.name != "scenery"]
+    names = [item.name for item in fields(Particles) if item.name not in ("scenery", "occluders")]
     return _with_padding_masked(Particles(**{name: joined(name) for name in names}, scenery=particles.scenery))
 
 
