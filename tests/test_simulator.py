@@ -100,6 +100,44 @@ def test_rays_of_a_step_see_the_particles_of_that_step():
         assert torch.allclose(model(data).rendered.rgbs[:, step], alone.rgbs, atol=1e-6)
 
 
+class Remembers(torch.nn.Module):
+    """Draws black, and keeps the particles that it was given."""
+
+    def forward(self, particles, rays, keys):
+        self.particles = particles
+        return RenderedRays(torch.zeros_like(rays.origins), *2 * [rays.origins[..., 0]])
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("has_future", [True, False])
+def test_shadows_of_a_training_are_those_of_what_is_seen_later(training, has_future, monkeypatch):
+    model, data = simulator(Drift()).train(training), batch()
+    model.renderer = Remembers()
+
+    def observe(frames, keys, purpose):
+        return {"positions": frames.depth[:, 0, 0, :3, None].expand(-1, -1, 3), "mask": frames.depth[:, 0, 0, :3] > 1.9}
+
+    monkeypatch.setattr(model.encoder, "observe", observe)
+    later = torch.linspace(1.8, 2.0, 2 * NUM_STEPS * 2 * 64).reshape(2, NUM_STEPS, 2, 8, 8)
+    cameras = Cameras(*(part.expand(2, NUM_STEPS, 2, -1, -1) for part in pose_parts()), 8, 8)
+    future = RGBDFrames(torch.zeros(*later.shape, 3, dtype=torch.uint8), later, cameras)
+
+    model(replace(data, future=future) if has_future else data)
+
+    occluders = model.renderer.particles.occluders
+    if not (training and has_future):
+        assert occluders is None
+        return
+    for row, (number, step) in enumerate(itertools.product(range(2), range(NUM_STEPS))):
+        assert torch.equal(occluders.positions[row, :, 0], later[number, step, 0, 0, :3])
+        assert torch.equal(occluders.mask[row], later[number, step, 0, 0, :3] > 1.9)
+
+
+def pose_parts():
+    cameras = looking_down()
+    return cameras.intrinsics, cameras.cam_to_world
+
+
 def test_checkpointed_dynamics_gives_the_same_gradients():
     gradients = []
     for checkpointed in (False, True):

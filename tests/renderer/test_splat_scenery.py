@@ -1,3 +1,4 @@
+import math
 from dataclasses import fields, replace
 
 import pytest
@@ -6,7 +7,7 @@ import torch
 from tests.renderer.test_splat import renderer as plain_renderer
 from vpd_lightning.renderer.shadows import Shadows
 from vpd_lightning.renderer.splat import SplatRenderer, occluders_of
-from vpd_lightning.types import Particles, Rays, Scenery
+from vpd_lightning.types import Occluders, Particles, Rays, Scenery
 
 GRAY, RED, GREEN = [0.4, 0.5, 0.6], [0.9, 0.1, 0.1], [0.1, 0.8, 0.2]
 HEIGHT = 2.0
@@ -82,6 +83,7 @@ def with_side_light(model):
     with torch.no_grad():
         model.shadows.directions.copy_(tensor([[1.0, 0.0, 1.0]]))
         model.shadows.shares.copy_(tensor([[0.3, 0.2, 0.1]]))
+        model.shadows.log_softness.fill_(math.log(0.01))  # of a decimetre's body, its middle stays dark
     return model
 
 
@@ -259,6 +261,19 @@ def test_occluders_are_packed_moving_particles_of_each_member():
         expected = both.positions[member][moving[member] & mask[member]]
         assert torch.equal(positions[member][there[member]], expected)
     assert there.shape[1] == int((moving & mask).sum(dim=1).max())
+
+
+def test_occluders_that_particles_bring_cast_in_place_of_the_moving_ones():
+    model, rays = floor_only(with_side_light(renderer())), straight_down(BESIDE)
+    body, far_away = ball(BALL), ball([0.0, -0.7, 0.4])
+    seen = Occluders(body.positions, body.mask)
+
+    predicted_there = model(replace(body, scenery=floor()), rays, None).rgbs
+    seen_there = model(replace(far_away, scenery=floor(), occluders=seen), rays, None).rgbs
+    nowhere = model(replace(body, scenery=floor(), occluders=Occluders(seen.positions, ~seen.mask)), rays, None).rgbs
+
+    torch.testing.assert_close(seen_there, predicted_there, rtol=0, atol=1e-9)
+    assert (predicted_there[0, 0] < 0.95 * tensor(GRAY)).all() and (nowhere[0, 0] > 0.99 * tensor(GRAY)).all()
 
 
 def test_a_body_that_was_added_last_casts_a_shadow_as_well():
