@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from vpd_lightning.metrics.registry import metric
+
 STEPS = tuple(f"step {step}" for step in (1, 4, 8, 16, 32))
 FORMS = {
     "updates": ".0f", "s an update": ".2f", "PSNR": ".2f", "PSNR moving": ".2f", "SSIM": ".3f", "size 32": ".2f",
@@ -40,6 +42,9 @@ SCENES = {
     "deformable_collision": "two soft bodies",
     "movi_a": "rigid bodies",
 }
+
+
+_PAPER = Path(__file__).resolve().parents[1] / "docs" / "results" / "paper_table2.json"
 
 
 def motion(content: Mapping[str, Any], path: Path) -> str:
@@ -175,21 +180,30 @@ def _line(cells: Iterable[str]) -> str:
 
 
 def releases(content: None, path: Path) -> str:
-    """One row for each released model in the folder."""
-    lines = _head(["model", "data", "trained for", "PSNR of moving pixels, test set", "better reference"], 3)
+    """One row for each released model in the folder, beside the better reference and what the paper printed."""
+    printed = json.loads(_PAPER.read_text())
+    titles = ["PSNR (dB)", "better reference", "the paper's VPD", "SSIM", "better reference", "the paper's VPD"]
+    lines = _head(["model", "data", "trained for", *titles, "PSNR of moving pixels (dB)", "better reference"], 3)
     found = [
         json.loads(file.read_text()) | {"folder": file.parent.name} for file in sorted(path.glob("*/metrics.json"))
     ]
     for metrics in sorted(found, key=lambda item: (item["experiment"] != "demo", -item["psnr_moving"]["mean"])):
-        folder, training = metrics["folder"], metrics["training"]
+        folder, training, experiment = metrics["folder"], metrics["training"], metrics["experiment"]
         minutes = training["minutes_allowed"]
         length = f"{minutes} minutes of one core" if minutes else f"{training['steps']:,} updates"
-        better = max(item["psnr_moving"]["mean"] for item in metrics["references"].values())
-        steps = metrics["protocol"]["num_steps"]
-        lines.append(
-            f"| [{folder}](released/{folder}) | {SCENES[metrics['experiment']]} | {length} | "
-            f"{metrics['psnr_moving']['mean']:.2f} dB over {steps} steps | {better:.2f} dB |"
-        )
+        cells = [
+            f"[{folder}](released/{folder})",
+            f"{SCENES[experiment]}, {metrics['protocol']['num_steps']} steps",
+            length,
+        ]
+        for score in ("psnr", "ssim", "psnr_moving"):
+            digits = metric(score).digits
+            better = max(item[score]["mean"] for item in metrics["references"].values())
+            cells += [f"{value:.{digits}f}" for value in (metrics[score]["mean"], better)]
+            if score in printed:
+                known = printed[score].get(experiment)
+                cells.append("-" if known is None else f"{known:.{digits}f}")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
