@@ -39,7 +39,7 @@ class Shadows(nn.Module):
     """How much light reaches a point past the bodies, from ``num_lights`` lights far away.
 
     A body hides a light within its outline as seen from there: each of its points covers as much of that as no other
-    point does, so that neither their number nor how many lie behind one another matters. The outline's edge is blurred
+    point does, so that their number and how many lie behind one another hardly matter. The outline's edge is blurred
     by ``softness`` (metres, learned) and, the higher the body is, the wider, as below a light of some size (a
     penumbra's slope, learned: about the tangent of half the light's angle). Each light has a learned direction and a
     learned share of the light per colour channel. Directions start spread over the upper half; pixels decide which of
@@ -138,7 +138,7 @@ class _Beam(NamedTuple):
     ) -> Float[Tensor, "batch occluder"]:
         """Return how much each point adds to the outline of all: one over the number of points on its line.
 
-        The sum over points of this times their kernels is then about 1 within the outline.
+        The sum over points of this times their kernels is then about 1 within the outline. Constant for gradients.
         """
         casting = occluders @ _across(self.direction).mT / (math.sqrt(2) * self.reach[:, None, None])
         square = casting.square().sum(dim=-1)
