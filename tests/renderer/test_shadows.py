@@ -275,6 +275,18 @@ def test_parameters_are_part_of_the_picture_even_where_all_lights_went_out():
         assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
 
 
+def test_a_light_that_is_gone_has_gradients_of_zero_and_one_that_went_out_may_come_back():
+    model, (points, occluders, mask) = shadows(), scene()
+    with torch.no_grad():
+        model.shares.copy_(torch.tensor([[0.2] * 3, [-0.05] * 3, [-0.4] * 3]))
+
+    model(points, occluders, mask).sum().backward()
+
+    assert model.shares.grad[1].abs().min() > 0
+    for name, parameter in model.named_parameters():
+        assert torch.equal(parameter.grad[2], torch.zeros_like(parameter.grad[2])), name
+
+
 @pytest.mark.parametrize(("num_lights", "softness"), [(0, 0.1), (2, 0.0), (1, -1.0)])
 def test_wrong_settings_are_refused(num_lights, softness):
     with pytest.raises(ValueError, match="num_lights must be at least 1 and softness positive"):
