@@ -29,7 +29,7 @@ _BEGIN = 2.0
 """Half widths above a point at which an occluder begins to count: what touches the point is its own surface."""
 
 _GONE = -0.3
-"""Share of a light that training no longer computes. Of four lights three are there after a few hundred updates, and
+"""Share of a light that training no longer computes. Of four lights three are below it after some hundred updates, and
 in the trainings looked at none came back from below."""
 
 _POINTS_PER_BLOCK = 16384
