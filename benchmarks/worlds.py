@@ -7,7 +7,7 @@ from torch import Tensor
 
 from vpd_lightning.geometry.cameras import pixel_rays
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Cameras, Particles, Rays, RGBDFrames, VideoBatch
+from vpd_lightning.types import Cameras, Particles, Rays, RGBDFrames, Scenery, VideoBatch
 
 # Middle and half sizes of boxes on the floor of the workspace of +-1 m.
 BOXES = (
@@ -40,6 +40,39 @@ def surface_particles(count: int, seed: int = 0, feature_dim: int = 16) -> Parti
 def two_frames(count: int, seed: int = 0) -> tuple[Particles, Particles]:
     """Return previous and current particles of one scene, drawn independently, without correspondences."""
     return surface_particles(count, 2 * seed + 1), surface_particles(count, 2 * seed)
+
+
+def block_above(count: int, seed: int = 0, feature_dim: int = 16) -> Particles:
+    """Return particles (batch axis of 1) of a moving block of 20 cm, half a metre above the floor, with its normals."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(count, 3, generator=generator) * 2 - 1
+    face = torch.randint(0, 3, (count,), generator=generator)
+    rows = torch.arange(count)
+    normals = torch.zeros(count, 3)
+    normals[rows, face] = points[rows, face].sign()
+    points[rows, face] = normals[rows, face]
+    positions = 0.1 * points + torch.tensor([0.0, 0.0, 0.5])
+    features = torch.rand(count, feature_dim, generator=generator)
+    is_moving = torch.ones(1, count, dtype=torch.bool)
+    return Particles(positions[None], features[None], moving=is_moving, normals=normals[None])
+
+
+def floor_as_seen(count: int, occluders: Tensor, seed: int = 0) -> Scenery:
+    """Return a floor of 2 x 2 m as so many pixels saw it from above, in the shadow of ``occluders`` (``1 point 3``)."""
+    generator = torch.Generator().manual_seed(seed)
+    positions = torch.rand(1, count, 3, generator=generator) * 2 - 1
+    positions[..., 2] = 0.0
+    up = torch.tensor([0.0, 0.0, 1.0]).expand_as(positions)
+    return Scenery(
+        positions=positions,
+        colors=torch.rand(1, count, 3, generator=generator),
+        normals=up,
+        views=-up,
+        sizes=torch.full((1, count), 2 / math.sqrt(count)),
+        mask=torch.ones(1, count, dtype=torch.bool),
+        occluders=occluders,
+        occluder_mask=torch.ones(occluders.shape[:2], dtype=torch.bool),
+    )
 
 
 def camera(size: int, distance: float = 2.2) -> Cameras:

@@ -6,7 +6,7 @@ from typing import Any
 
 from vpd_lightning.errors import ConfigError
 
-SUITES = ("neighbors", "renderer", "dynamics", "train_step", "rollout", "accuracy", "scaling", "data")
+SUITES = ("neighbors", "renderer", "dynamics", "train_step", "rollout", "accuracy", "scaling", "scenery", "data")
 
 
 def chosen(names: list[str]) -> list[str]:

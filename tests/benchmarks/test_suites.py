@@ -19,7 +19,7 @@ from vpd_lightning.errors import ConfigError
 
 CPU = torch.device("cpu")
 FIELDS = {"name", "baseline", "seconds", "baseline_seconds", "ratio", "error", "psnr", "peak_bytes", "note"}
-WITHOUT_CHECKPOINT = ("neighbors", "renderer", "dynamics", "train_step", "rollout", "scaling", "data")
+WITHOUT_CHECKPOINT = ("neighbors", "renderer", "dynamics", "train_step", "rollout", "scaling", "scenery", "data")
 
 
 def check(suite: str, result: Result, folder: Path) -> dict:

@@ -16,8 +16,8 @@ def point_spacing(
     """
     some, valid = positions[:, :_NUM_SPACED], mask[:, :_NUM_SPACED]
     both = valid[:, :, None] & mask[:, None]
-    square = (some[:, :, None] - positions[:, None]).square().sum(dim=-1).masked_fill(~both, torch.inf)
+    pairs = torch.cdist(some, positions, compute_mode="donot_use_mm_for_euclid_dist").masked_fill(~both, torch.inf)
     rank = min(5, positions.shape[1])  # itself is the nearest
-    distances = square.topk(rank, dim=-1, largest=False).values[..., -1].sqrt()
+    distances = pairs.topk(rank, dim=-1, largest=False).values[..., -1]
     usable = torch.where(valid & torch.isfinite(distances), distances, torch.nan)
     return torch.nan_to_num(usable.nanmedian(dim=1).values, nan=0.0)

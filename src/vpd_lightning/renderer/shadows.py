@@ -147,10 +147,10 @@ class _Beam(NamedTuple):
         The sum over points of this times their kernels is then about 1 within the outline. Constant for gradients.
         """
         casting = occluders @ _across(self.direction).mT / (math.sqrt(2) * self.reach[:, None, None])
-        square = casting.square().sum(dim=-1)
-        pairs = 2 * casting @ casting.mT - square[..., None] - square[..., None, :]
-        stacked = (decay(pairs.clamp(max=0)) * mask[..., None, :]).sum(dim=-1)
-        return mask / stacked.clamp(min=1)
+        square, one = casting.square().sum(dim=-1, keepdim=True), torch.ones_like(casting[..., :1])
+        rows, columns = torch.cat([2 * casting, -square, one], dim=-1), torch.cat([casting, one, -square], dim=-1)
+        kernels = decay((rows @ columns.mT).clamp_(max=0))
+        return mask / (kernels @ mask[..., None].to(kernels.dtype)).squeeze(-1).clamp(min=1)
 
     @property
     def height(self) -> Float[Tensor, " batch"]:
