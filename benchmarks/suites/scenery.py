@@ -33,8 +33,8 @@ def run(options: Options) -> Result:
     sizes = [2**power for power in options.pick(range(10, 18), range(10, 15), range(6, 9))]
     rows += _growth(sizes, replace(options, repeats=min(options.repeats, 3)))
     facts = {}
-    for name in ("first frame", "next frame", "memory"):
-        points = [(int(r.name.split("/")[1]), r.seconds or r.peak_bytes) for r in rows if r.name.startswith(f"{name}/")]
+    for name in ("first frame", "next frame"):
+        points = [(int(r.name.split("/")[1]), r.seconds or 0.0) for r in rows if r.name.startswith(f"{name}/")]
         facts[f"exponent of {name}"] = plots.fitted_exponent(*zip(*points, strict=True))[0]
     return Result(rows, facts)
 
@@ -140,7 +140,7 @@ def _growth(sizes: list[int], options: Options) -> list[Row]:
         functions = {str(count): frame(count, size, 4, is_first, where) for count in sizes}
         seconds = interleaved(functions, options.repeats, options.device)
         rows += [row(f"{name}/{count}", seconds[str(count)], note=f"{size}x{size} pixels") for count in sizes]
-    for count in options.pick(sizes, sizes, sizes[:: len(sizes) - 1]):
+    for count in sizes[:: len(sizes) - 1]:  # each takes a process of its own
         arguments = {"points": count, "size": size, "num_lights": 4, "is_first": True, "device": where}
         if options.device.type == "cuda":
             peak = device_peak(frame(**arguments), options.device)
@@ -151,13 +151,12 @@ def _growth(sizes: list[int], options: Options) -> list[Row]:
 
 
 def draw(result: Result, path: Path) -> None:
-    """Draw time and memory over points of scenery."""
+    """Draw the time of frames over points of scenery; what memory is needed beside the points hardly changes."""
     curves: dict[str, tuple[list[float], list[float]]] = {}
     for item in result.rows:
         name, _, count = item.name.rpartition("/")
-        if name in ("first frame", "next frame", "memory"):
+        if name in ("first frame", "next frame"):
             sizes, values = curves.setdefault(name, ([], []))
             sizes.append(float(count))
-            values.append(1000 * item.seconds if item.seconds is not None else (item.peak_bytes or 0) / 2**20)
-    frames = {name: curve for name, curve in curves.items() if name != "memory"}
-    plots.scaling({"Frame, milliseconds": frames, "Memory, MiB": {"first frame": curves["memory"]}}, path)
+            values.append(1000 * (item.seconds or 0.0))
+    plots.scaling({"Frame, milliseconds": curves}, path)

@@ -16,7 +16,9 @@ def point_spacing(
     """
     some, valid = positions[:, :_NUM_SPACED], mask[:, :_NUM_SPACED]
     both = valid[:, :, None] & mask[:, None]
-    pairs = torch.cdist(some, positions, compute_mode="donot_use_mm_for_euclid_dist").masked_fill(~both, torch.inf)
+    # The direct form, not the matrix one; it takes a third of the time that differences with an axis of 3 take.
+    pairs = torch.cdist(some, positions, compute_mode="donot_use_mm_for_euclid_dist")  # noqa: TID251
+    pairs = pairs.masked_fill(~both, torch.inf)
     rank = min(5, positions.shape[1])  # itself is the nearest
     distances = pairs.topk(rank, dim=-1, largest=False).values[..., -1]
     usable = torch.where(valid & torch.isfinite(distances), distances, torch.nan)
