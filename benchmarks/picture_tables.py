@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from vpd_lightning.metrics.registry import DRAWN, metric
+from vpd_lightning.metrics.registry import DRAWN, NOTHING_MOVES, TRUE_VELOCITY, metric
 
 _TITLES = {
     "prediction": "prediction",
@@ -22,15 +22,32 @@ def picture_runs(content: Mapping[str, Any], path: Path) -> str:
 
 
 def picture_sets(content: Mapping[str, Any], path: Path) -> str:
-    """As ``picture_runs`` for several data sets below each other; evaluations are named ``DATA SET: MODEL``."""
+    """Several data sets below each other; evaluations are named ``DATA SET: MODEL``. Scores: input / other cameras."""
     sets: dict[str, dict[str, Any]] = {}
     for name, row in content.items():
         data_set, _, model = name.partition(": ")
         sets.setdefault(data_set, {})[model] = row
-    lines = _head(["", "", *_run_titles(content)], 2)
+    later = _steps(content)[-2:]
+    titles = [*(metric(name).label for name in _SCORES), *(f"centroid {step} (cm)" for step in later), "updates"]
+    lines = _head(["", "", *titles], 2)
+
+    def add(words: list[str], pictures: Mapping[str, Any], centroid: Mapping[str, float], updates: str) -> None:
+        scores = (_by_cameras(pictures, score) for score in _SCORES)
+        lines.append(
+            _row(words[0], [words[1], *scores, *(_centimetres(centroid.get(step)) for step in later), updates])
+        )
+
     for data_set, rows in sets.items():
-        for number, (name, cells) in enumerate(_run_rows(rows)):
-            lines.append(_row("" if number else data_set, [name, *cells]))
+        for number, (name, row) in enumerate(rows.items()):
+            centroid = row["centroid_error"].get("prediction", {})
+            add(["" if number else data_set, name], row["pictures"]["prediction"], centroid, f"{row['step']:,}")
+        first = next(iter(rows.values()))
+        for source in ("copy_last", "train_mean", NOTHING_MOVES, TRUE_VELOCITY, "best_constant"):
+            known = source in ("copy_last", "train_mean")
+            pictures = first["pictures"].get(source, {}) if known else {}
+            centroid = first["centroid_error"].get(source, {})
+            if pictures or centroid:
+                add(["", _TITLES[source].replace(", same renderer", "")], pictures, centroid, "")
     return "\n".join(lines)
 
 
@@ -83,6 +100,13 @@ def picture_horizons(content: Mapping[str, Any], path: Path) -> str:
 
 def _shown(pictures: Mapping[str, Any], score: str) -> str:
     return metric(score).shown(pictures[score]["mean"]) if score in pictures else ""
+
+
+def _by_cameras(pictures: Mapping[str, Any], score: str) -> str:
+    if score not in pictures:
+        return ""
+    parts = (pictures[score]["input_views"], pictures[score]["other_views"])
+    return " / ".join(metric(score).shown(part) for part in parts if part is not None)
 
 
 def _centimetres(value: float | None) -> str:

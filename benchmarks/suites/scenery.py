@@ -127,10 +127,10 @@ def _updates(options: Options) -> list[Row]:
     seconds = interleaved(functions, options.repeats, options.device)
     note = f"the renderer alone, forward and backward: {CLIPS} clips of {STEPS} steps of {RAYS} rays"
     there = seconds["without scenery"]
-    return [
-        row(f"update/{name}", taken, *(("without scenery", there) if name != "without scenery" else ()), note=note)
-        for name, taken in seconds.items()
-    ]
+    rows = [row("update/without scenery", there, note=note)]
+    for name in list(functions)[1:]:
+        rows.append(row(f"update/{name}", seconds[name], "without scenery", there, note=note))
+    return rows
 
 
 def _growth(sizes: list[int], options: Options) -> list[Row]:

@@ -78,7 +78,10 @@ def test_data_sets_stand_below_each_other_with_their_own_references(tmp_path: Pa
     out = tmp_path / "out.json"
     names = [("block: new", "new"), ("block: old", "old"), ("ball: new", "new")]
     pictures.main([str(out), *(f"{name}={tmp_path / folder}" for name, folder in names)])
-    lines = picture_tables.picture_sets(json.loads(out.read_text()), out).splitlines()
+    content = json.loads(out.read_text())
+    content["block: new"]["pictures"]["prediction"]["psnr"]["other_views"] = 0.25
+    lines = picture_tables.picture_sets(content, out).splitlines()
+    assert lines[2] == "| block | new | 0.50 / 0.25 | 0.50 | 0.500 | 0.500 | 0.500 | 4.0 | 8.0 | 9 |"
     assert [line.split(" | ")[:2] for line in lines[2:]] == [
         ["| block", "new"],
         ["| ", "old"],
