@@ -87,6 +87,23 @@ def test_one_moment_of_the_recordings_cameras_is_compared_with_the_truth(checkpo
     assert cv2.imread(str(out / "contact_sheet.png")).shape[0] > 4 * 256
 
 
+def test_films_are_written_in_the_formats_that_were_asked_for(checkpoint: Path, tmp_path: Path) -> None:
+    words = [f"ckpt={checkpoint}", "camera=0", "num_steps=2", "save_particles=[]"]
+    assert main([*words, "save_films=[webp,gif]", f"out={tmp_path}/loops"]) == 0
+    films = [f"camera_00{kind}.{end}" for kind in ("", "_comparison") for end in ("gif", "webp")]
+    assert sorted(path.name for path in (tmp_path / "loops").iterdir()) == sorted(
+        [*films, "camera_00.png", "contact_sheet.png", "particles.png", "render.json"]
+    )
+    described = json.loads((tmp_path / "loops" / "render.json").read_text())["films"]
+    assert described == ["camera_00.webp", "camera_00.gif"]
+    assert main([*words, "save_films=[]", f"out={tmp_path}/none"]) == 0
+    assert sorted(path.name for path in (tmp_path / "none").iterdir()) == [
+        "camera_00.png", "contact_sheet.png", "particles.png", "render.json",
+    ]  # fmt: skip
+    assert main([*words, "save_films=[avi]", f"out={tmp_path}/never"]) == 2
+    assert not (tmp_path / "never").exists()
+
+
 def test_a_frozen_moment_is_the_same_as_in_the_film(checkpoint: Path, tmp_path: Path) -> None:
     words = [f"ckpt={checkpoint}", "camera=1", "save_maps=[depth,opacity]", "save_particles=[npz]"]
     assert main([*words, "num_steps=3", f"out={tmp_path}/film"]) == 0

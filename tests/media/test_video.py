@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.media.video import comparison_frames, enlarge, error_image, write_video
@@ -29,13 +30,28 @@ def test_a_film_shows_what_was_written(tmp_path: Path, suffix: str, capfd: pytes
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_a_looping_picture_shows_what_was_written(tmp_path: Path, suffix: str) -> None:
+    frames = np.zeros((6, 63, 95, 3), np.uint8)
+    for time in range(6):
+        frames[time, 16:48, 10 * time : 10 * time + 32] = [220, 40, 40 * time]
+    write_video(tmp_path / f"film{suffix}", frames, 4.0)
+    assert [path.name for path in tmp_path.iterdir()] == [f"film{suffix}"]
+    with Image.open(tmp_path / f"film{suffix}") as film:
+        assert film.info["loop"] == 0 and film.n_frames == 6
+        for time in range(6):
+            film.seek(time)
+            shown = np.asarray(film.convert("RGB")).astype(int)
+            assert film.info["duration"] == 250 and np.abs(shown - frames[time]).mean() < 4
+
+
 def test_odd_sizes_lose_a_row_and_a_column(tmp_path: Path) -> None:
     write_video(tmp_path / "film.webm", np.full((2, 65, 97, 3), 100, np.uint8), 10.0)
     assert read_back(tmp_path / "film.webm").shape == (2, 64, 96, 3)
 
 
 def test_other_formats_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"film\.avi.*\n.*\.webm, \.mp4"):
+    with pytest.raises(ConfigError, match=r"film\.avi.*\n.*\.webm, \.mp4, \.webp, \.gif"):
         write_video(tmp_path / "film.avi", np.zeros((2, 64, 64, 3), np.uint8), 10.0)
 
 

@@ -71,7 +71,8 @@ def _render(config: Mapping[str, Any]) -> None:
         truth = None
         if viewpoints.views is not None and not operations:  # of an edited scene there is no truth
             truth = render_rollout.recorded_frames(path, start, list(states), viewpoints.views)
-        render_rollout.write_videos(partial, viewpoints, rendered, truth, config["fps"], config["save_maps"])
+        kinds = config["save_films"]
+        render_rollout.write_videos(partial, viewpoints, rendered, truth, config["fps"], config["save_maps"], kinds)
         if freeze_step is not None:
             render_rollout.write_moment_sheet(partial, viewpoints, rendered, truth, freeze_step, config["save_maps"])
         render_rollout.write_particle_folder(partial, model.simulator, clip, states, config["save_particles"])
@@ -90,7 +91,7 @@ def _render(config: Mapping[str, Any]) -> None:
                 "camera": config["camera"],
                 "height": viewpoints.cameras.height,
                 "width": viewpoints.cameras.width,
-                "films": [f"{name}.webm" for name in viewpoints.names] if is_film else [],
+                "films": [f"{name}.{kind}" for name in viewpoints.names for kind in kinds] if is_film else [],
                 "maps": config["save_maps"],
             },
         )
@@ -105,6 +106,7 @@ def _render(config: Mapping[str, Any]) -> None:
 def _check(config: Mapping[str, Any]) -> None:
     from vpd_lightning.media.filmed_maps import MAPS
     from vpd_lightning.media.render_rollout import PARTICLE_FORMATS
+    from vpd_lightning.media.video import FILM_FORMATS
 
     for name, lowest in (("num_steps", 1), ("start_frame", 0)):
         if config[name] < lowest:
@@ -126,7 +128,7 @@ def _check(config: Mapping[str, Any]) -> None:
                 "num_views is the number of camera positions on a ring around one frozen step.\n"
                 "Set camera=ring and freeze_step=STEP, or leave num_views out."
             )
-    for name, allowed in (("save_particles", PARTICLE_FORMATS), ("save_maps", MAPS)):
+    for name, allowed in (("save_films", FILM_FORMATS), ("save_particles", PARTICLE_FORMATS), ("save_maps", MAPS)):
         unknown = [word for word in config[name] if word not in allowed]
         if unknown or len(set(config[name])) < len(config[name]):
             said = repr(unknown[0]) if unknown else "a word twice"

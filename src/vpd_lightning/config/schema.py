@@ -178,6 +178,7 @@ class RenderConfig(RecordingConfig):
     width: int | None = None
     fps: float = MISSING
     out: str | None = None
+    save_films: list[str] = MISSING
     save_particles: list[str] = MISSING
     save_maps: list[str] = MISSING
     save_camera_path: bool = MISSING

@@ -93,15 +93,16 @@ def write_videos(
     truth: NDArray[np.uint8] | None,
     fps: float,
     save_maps: Sequence[str],
+    save_films: Sequence[str],
 ) -> None:
-    """Write one film per camera, a picture of the middle frame, its maps, and comparisons where the ``truth`` is given.
+    """Write each camera's films, picture of the middle frame and maps, and comparisons where the ``truth`` is given.
 
     ``truth`` is (time, camera, height, width, 3). A single frame makes a picture, and no film.
     """
     frames = rendered.rgb.numpy()
     for number, name in enumerate(viewpoints.names):
-        if len(frames) > 1:
-            write_video(folder / f"{name}.webm", np.stack([enlarge(image) for image in frames[:, number]]), fps)
+        for kind in save_films if len(frames) > 1 else ():
+            write_video(folder / f"{name}.{kind}", np.stack([enlarge(image) for image in frames[:, number]]), fps)
         write_png(folder / f"{name}.png", enlarge(frames[len(frames) // 2, number]))
         if save_maps:
             cameras = viewpoints.cameras if viewpoints.moving else viewpoints.cameras[number]
@@ -111,7 +112,8 @@ def write_videos(
         return
     labels = [f"step {step}" for step in range(len(frames))]
     for number, name in enumerate(viewpoints.names):
-        write_video(folder / f"{name}_comparison.webm", comparison_frames(truth, frames, [number], labels), fps)
+        for kind in save_films:
+            write_video(folder / f"{name}_comparison.{kind}", comparison_frames(truth, frames, [number], labels), fps)
     steps = np.unique(np.linspace(1, len(frames) - 1, min(len(frames) - 1, 6)).round().astype(int)).tolist()
     rows = [(name, truth[1:, i], frames[1:, i]) for i, name in enumerate(viewpoints.names[:_MAX_PANELS])]
     write_contact_sheet(folder / "contact_sheet.png", rows, steps, "truth, prediction and error")

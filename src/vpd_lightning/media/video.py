@@ -1,18 +1,22 @@
-"""Videos of predictions: VP9 in WebM or MP4, written by OpenCV, playable in a browser."""
+"""Films of predictions: VP9 in WebM or MP4 by OpenCV, looping WebP or GIF by Pillow; browsers play all four."""
 
 import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from vpd_lightning.errors import ConfigError
 
 _CODECS = {".webm": "VP90", ".mp4": "vp09"}
+_ANIMATED: dict[str, dict[str, Any]] = {".webp": {"quality": 85, "method": 6}, ".gif": {"optimize": True}}
+FILM_FORMATS = tuple(suffix[1:] for suffix in (*_CODECS, *_ANIMATED))
 _MIN_PANEL = 256
 _ERROR_RANGE = 0.5
 _LABEL_HEIGHT = 22
@@ -20,22 +24,31 @@ _DARK = 24
 
 
 def write_video(path: Path, frames: NDArray[np.uint8], frames_per_second: float) -> None:
-    """Write RGB frames (time, height, width, 3) as VP9; ``path`` exists only when the video is complete.
+    """Write RGB frames (time, height, width, 3); ``path`` exists only when the film is complete.
 
-    Odd sizes lose their last row or column (VP9 stores colour at half resolution).
+    The suffix decides: .webm and .mp4 are VP9, whose odd sizes lose their last row or column (it stores colour at half
+    resolution); .webp and .gif are pictures that loop, for pages and slides that take no video.
 
     Raises:
-        ConfigError: the suffix is neither .webm nor .mp4, or this OpenCV cannot write VP9.
+        ConfigError: another suffix, or this OpenCV cannot write VP9.
         ValueError: there is no frame, or frames are not (height, width, 3).
     """
     if frames.ndim != 4 or frames.shape[-1] != 3 or min(frames.shape[:3]) < 1 or frames.dtype != np.uint8:
         raise ValueError(f"frames must be uint8 (time, height, width, 3), got {frames.dtype} {frames.shape}")
     suffix = path.suffix.lower()
-    if suffix not in _CODECS:
-        raise ConfigError(f"Cannot write a video named {path.name}.\nAllowed suffixes: {', '.join(_CODECS)}.")
+    if suffix[1:] not in FILM_FORMATS:
+        allowed = ", ".join(f".{name}" for name in FILM_FORMATS)
+        raise ConfigError(f"Cannot write a film named {path.name}.\nAllowed suffixes: {allowed}.")
     height, width = frames.shape[1] // 2 * 2, frames.shape[2] // 2 * 2
     partial = path.with_name(f".{path.stem}.partial{suffix}")
     try:
+        if suffix in _ANIMATED:
+            first, *others = [Image.fromarray(frame) for frame in frames]
+            duration = round(1000 / frames_per_second)  # milliseconds
+            options = {"duration": duration, "loop": 0, **_ANIMATED[suffix]}
+            first.save(partial, save_all=True, append_images=others, **options)
+            os.replace(partial, path)
+            return
         with _without_native_stderr():
             writer = cv2.VideoWriter(
                 str(partial), cv2.VideoWriter.fourcc(*_CODECS[suffix]), frames_per_second, (width, height)
