@@ -61,7 +61,8 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_everything_imported_is_required():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    lines = [*project["dependencies"], *extras["cluster"], *extras["ros"], *extras["lerobot"], *extras["viewer"]]
+    optional = [line for name in ("cluster", "ros", "lerobot", "viewer", "lpips") for line in extras[name]]
+    lines = [*project["dependencies"], *optional]
     required = {Requirement(line).name for line in lines}
     imported = set()
     files = {path for folder in ("src", "data_gen", "benchmarks") for path in (ROOT / folder).rglob("*.py")}
@@ -74,7 +75,7 @@ def test_everything_imported_is_required():
     # The contract tests in vpd_lightning.testing run under pytest; PyTorch's builds for GPUs bring triton themselves.
     # Playwright drives the browser that one benchmark measures.
     own = {"vpd_lightning", "data_gen", "benchmarks", "pytest", "triton", "playwright"}
-    packages = {"torch_cluster": ["torch-cluster"], **packages_distributions()}
+    packages = {"torch_cluster": ["torch-cluster"], "torchvision": ["torchvision"], **packages_distributions()}
     missing = {
         name
         for name in imported - own - sys.stdlib_module_names

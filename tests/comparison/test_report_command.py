@@ -39,7 +39,8 @@ def test_the_report_prints_what_the_evaluations_say(runs: Path):
     means = [json.loads((runs / f"vpd{i}/evaluation/metrics.json").read_text())["psnr"]["mean"] for i in (0, 1)]
     row = next(line for line in text.splitlines() if line.startswith("| vpd |") and "60 min cpu" in line)
     assert row.startswith(f"| vpd | **{np.mean(means):.2f}** [")
-    assert row.endswith("| 60 min cpu | 60.0 | cpu | 500 | 12,345 | 2 |")
+    # 0.14 s for encoding and rollout, 0.60 and 0.62 s of rendering, over 4 steps from 2 cameras.
+    assert row.endswith("| 60 min cpu | 60.0 | cpu | 500 | 12,345 | 93.8 | 2 |")
     assert re.search(r"\| slotformer \| 10\.8\d \[", text)
     assert "vpd (data.num_trajectories=16)" in text and "copy last input frame" in text
     assert "PSNR (dB): vpd" in text and "no other system's interval reaches its own" in text
@@ -58,8 +59,19 @@ def test_the_spreadsheet_has_a_row_per_run(runs: Path):
     assert float(rows["few"]["psnr"]) == metrics["psnr"]["mean"]
     assert float(rows["few"]["psnr_low"]) == metrics["psnr"]["ci95"][0]
     assert float(rows["few"]["centroid_error"]) == metrics["motion"]["centroid_error"]["mean"]
+    assert float(rows["few"]["milliseconds_per_frame"]) == pytest.approx(1000 * (0.04 + 0.1 + 0.5) / (4 * 2))
     assert rows["few"]["settings"] == "data.num_trajectories=16" and rows["few"]["is_main"] == "False"
     assert rows["slots"]["centroid_error"] == "" and rows["slots"]["minutes"] == "60.0"
+
+
+def test_time_against_error_is_drawn_where_evaluations_say_both(runs: Path, tmp_path: Path):
+    assert (runs / "report" / "time_error_mujoco_block.png").stat().st_size > 1000
+    run = write_run(tmp_path / "run")
+    path = run / "evaluation" / "metrics.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"seconds": {"total": 1.0}}))  # of an older version
+    assert main([str(run), f"out={tmp_path / 'report'}"]) == 0
+    assert not list((tmp_path / "report").glob("time_error_*"))
+    assert "| 12,345 | - | 1 |" in (tmp_path / "report" / "report.md").read_text()
 
 
 def test_strips_show_the_same_rollout_of_every_system(runs: Path):

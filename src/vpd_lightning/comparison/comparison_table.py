@@ -67,6 +67,13 @@ class Row:
         interval = found.interval if found else tuple(printed) if printed else None
         return Estimate(sum(means) / len(means), interval)
 
+    @property
+    def milliseconds_per_frame(self) -> float | None:
+        """Mean over the seeds of what a predicted picture took; None unless each of them says it."""
+        known = [run.milliseconds_per_frame for run in self.runs]
+        times = [time for time in known if time is not None]
+        return sum(times) / len(times) if len(times) == len(known) else None
+
     def per_step(self, name: str) -> list[float | None]:
         """Mean over the seeds of each step's printed mean; empty where there is none."""
         summaries = [metric(name).summary(run.metrics) for run in self.runs]

@@ -29,7 +29,8 @@ _READING = """\
   predict, can tell systems apart that intervals cannot.
 {metrics}
 - Budget: what a training was allowed; minutes: what it took, by the named clock; both with its pretraining. Steps:
-  updates behind the evaluated weights, without those of a pretraining.
+  updates behind the evaluated weights, without those of a pretraining. Ms per picture: wall time of a clip's
+  prediction, from input frames to pictures, over its pictures, on the machine of that evaluation and whatever ran there.
 - `-`: not known, or the system has no such thing."""
 
 
@@ -38,6 +39,7 @@ class TableFiles:
     """The pictures of one table, by what they show; ``not_shown`` names rollouts that are missing, and why."""
 
     rollout: Path | None
+    time_error: Path | None
     settings: Mapping[str, Path]
     sweeps: Sequence[tuple[Sweep, Path]]
     strips: Sequence[Path]
@@ -106,6 +108,8 @@ def _table(table: ComparisonTable, files: TableFiles) -> list[str]:
             lines += [words, ""]
     if files.rollout:
         lines += [_picture("scores over the rollout", files.rollout), ""]
+    if files.time_error:
+        lines += [_picture("scores and errors over milliseconds per predicted picture", files.time_error), ""]
     best = winners(table)
     if best:
         lines += ["### Who is best", "", *best, ""]

@@ -15,7 +15,7 @@ from vpd_lightning.comparison.sweep import Sweep
 from vpd_lightning.comparison.tables import TITLES
 from vpd_lightning.files import AtomicPath
 from vpd_lightning.metrics.metric_info import MetricInfo
-from vpd_lightning.metrics.registry import HEADLINE, REFERENCES, image_metrics, metric, scores
+from vpd_lightning.metrics.registry import HEADLINE, REFERENCES, image_metrics, metric, paired, scores
 from vpd_lightning.release.system_notes import COLORS
 
 _SPARE = ("#7f3c8d", "#a6761d", "#e31a1c", "#33a02c", "#1b1b6f", "#b15928")
@@ -78,6 +78,35 @@ def sweep_plot(path: Path, table: ComparisonTable, sweep: Sweep) -> bool:
         _sweep_axis(panel, sweep)
         panel.set_ylabel(info.label)
         panel.grid(alpha=0.3)
+    figure.suptitle(table.title, fontsize=11)
+    _legend(figure, panels)
+    _save(figure, path)
+    return True
+
+
+def time_error_plot(path: Path, table: ComparisonTable) -> bool:
+    """Draw every setting's scores and motion errors over what a predicted picture costs; intervals as bars.
+
+    False: there is nothing to draw.
+    """
+    timed = [row for row in table.rows if row.milliseconds_per_frame]
+    infos = [info for info in paired() if any(row.estimate(info.name) for row in timed)]
+    if not infos:
+        return False
+    figure = Figure(figsize=(4.2 * len(infos) + 1.8, 3.5), layout="constrained")
+    panels = list(figure.subplots(1, len(infos), squeeze=False)[0])
+    for panel, info in zip(panels, infos, strict=True):
+        for number, row in enumerate(timed):
+            points = [(row, row.milliseconds_per_frame or 0.0)]
+            _sweep_line(panel, info, row.name, points, number, is_joined=False)
+        for source in REFERENCES:
+            reference = table.reference(source, info.name)
+            if reference is not None:
+                panel.axhline(info.scale * reference.mean, label=TITLES[source], **_REFERENCE_STYLES[source])
+        panel.set_xscale("log")
+        panel.set_xlabel("milliseconds per predicted picture")
+        panel.set_ylabel(info.label)
+        panel.grid(alpha=0.3, which="both")
     figure.suptitle(table.title, fontsize=11)
     _legend(figure, panels)
     _save(figure, path)

@@ -104,6 +104,15 @@ class Run:
         return None if minutes is None else float(minutes)
 
     @property
+    def milliseconds_per_frame(self) -> float | None:
+        """Wall time of a clip's prediction, from input frames to pictures, over its pictures; that of its machine."""
+        seconds, protocol = self.metrics.get("seconds") or {}, self.metrics["protocol"]
+        parts = [seconds.get(f"{part}_per_clip") for part in ("encode", "rollout", "render")]
+        known = [float(part) for part in parts if part is not None]
+        num_pictures = (protocol.get("num_steps") or 0) * (protocol.get("num_views") or 0)
+        return 1000.0 * sum(known) / num_pictures if len(known) == len(parts) and num_pictures else None
+
+    @property
     def checkpoint_name(self) -> str | None:
         """Which of a run's checkpoints was evaluated: ``last.ckpt``, ``best.ckpt``."""
         name = self.metrics.get("checkpoint")
@@ -188,6 +197,7 @@ def _check_contents(run: Run) -> None:
                 sum([summary["mean"], low, high, *numbers], 0.0)
     sorted(run.metrics["protocol"].get("input_views") or ())
     _ = run.protocol, run.num_bootstrap, run.declared_budget, run.minutes, run.minutes_allowed, run.asked_to_differ
+    _ = run.milliseconds_per_frame
     run.metrics["references"].get("")
 
 

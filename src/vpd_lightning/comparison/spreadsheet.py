@@ -38,6 +38,7 @@ def _cells(table: ComparisonTable, row: Row, run: Run) -> dict[str, Any]:
         "clock": run.clock,
         "steps": run.steps,
         "parameters": run.num_parameters,
+        "milliseconds_per_frame": run.milliseconds_per_frame,
         "finite": run.metrics.get("finite"),
         "folder": str(run.folder),
         "evaluation": run.evaluation.name,

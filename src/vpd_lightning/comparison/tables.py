@@ -118,7 +118,7 @@ def _present(table: ComparisonTable, rows: Sequence[Row]) -> list[MetricInfo]:
     return [info for info in compared() if any(row.estimate(info.name) is not None for row in rows)]
 
 
-_COST = ("budget", "minutes", "clock", "steps", "parameters", "seeds")
+_COST = ("budget", "minutes", "clock", "steps", "parameters", "ms per picture", "seeds")
 
 
 def _cost(row: Row) -> list[str]:
@@ -132,6 +132,7 @@ def _cost(row: Row) -> list[str]:
         each(run.clock for run in row.runs),
         _mean_count([run.steps for run in row.runs]),
         each(_count(run) for run in row.runs),
+        "-" if row.milliseconds_per_frame is None else f"{row.milliseconds_per_frame:.1f}",
         str(len(row.runs)),
     ]
 

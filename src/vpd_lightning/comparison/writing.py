@@ -8,7 +8,7 @@ from vpd_lightning.comparison.comparison_table import ComparisonTable, compariso
 from vpd_lightning.comparison.comparison_video import write_films
 from vpd_lightning.comparison.kept_rollouts import kept_rollouts
 from vpd_lightning.comparison.page import TableFiles, page
-from vpd_lightning.comparison.plots import overview_plot, rollout_plot, settings_plot, sweep_plot
+from vpd_lightning.comparison.plots import overview_plot, rollout_plot, settings_plot, sweep_plot, time_error_plot
 from vpd_lightning.comparison.rollout_grid import write_strips
 from vpd_lightning.comparison.spreadsheet import write_spreadsheet
 from vpd_lightning.comparison.sweep import sweeps_of
@@ -35,6 +35,8 @@ def write_report(folder: Path, collection: Collection, title: str) -> list[str]:
 def _pictures(folder: Path, table: ComparisonTable) -> TableFiles:
     rollout = folder / f"rollout_{table.file_name}.png"
     drawn = rollout_plot(rollout, table)
+    time_error = folder / f"time_error_{table.file_name}.png"
+    timed = time_error_plot(time_error, table)
     sweeps = []
     for sweep in sweeps_of(table):
         path = folder / f"sweep_{table.file_name}_{sweep.file_name}.png"
@@ -51,7 +53,9 @@ def _pictures(folder: Path, table: ComparisonTable) -> TableFiles:
         films = write_films(folder, table, kept)
     except ConfigError as error:  # this OpenCV has no VP9; the rest of the report does not need it
         not_shown.append((Path("films"), str(error).splitlines()[0]))
-    return TableFiles(rollout if drawn else None, settings, sweeps, strips, films, not_shown)
+    return TableFiles(
+        rollout if drawn else None, time_error if timed else None, settings, sweeps, strips, films, not_shown
+    )
 
 
 def _with_settings(table: ComparisonTable) -> Sequence[str]:

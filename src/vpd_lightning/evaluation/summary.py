@@ -59,7 +59,7 @@ def _other_lines(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _spoken(means: Mapping[str, Any]) -> str:
-    return ", ".join(info.spoken(means[info.name]) for info in still_scores() if info.name in means)
+    return ", ".join(info.spoken(means[info.name]) for info in still_scores() if means.get(info.name) is not None)
 
 
 def horizons(num_steps: int) -> list[int]:
@@ -101,11 +101,11 @@ def _drawn_lines(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _unmeasured_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Say why a metric has no value, where a package was missing."""
+    """Say why a metric has no value, where what it needs was missing."""
     return [
-        f"{info.title} was not measured: the package {info.needs_package} was not installed."
+        f"{info.title} was not measured: {info.why_missing}."
         for info in image_metrics()
-        if info.needs_package and info.name in metrics and metrics[info.name]["mean"] is None
+        if info.why_missing and info.name in metrics and metrics[info.name]["mean"] is None
     ]
 
 

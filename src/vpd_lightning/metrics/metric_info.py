@@ -28,7 +28,7 @@ class MetricInfo:
 
     A metric is shown wherever it exists, unless ``in_tables`` (comparisons of systems) or ``in_summary`` say otherwise.
     ``needs_motion``: it counts moving pixels only. ``has_extremes``: its smallest and largest value are kept, too.
-    ``needs_package``: its values are NaN where this package is not installed, and summaries say so.
+    ``why_missing``: its values are NaN where something is not installed, and summaries then say this.
     ``reference_of`` names the metric of which this one is the value of a prediction that needs no model;
     ``sees_input`` is whether that prediction uses the input.
     """
@@ -47,7 +47,7 @@ class MetricInfo:
     in_summary: bool = True
     needs_motion: bool = False
     has_extremes: bool = False
-    needs_package: str | None = None
+    why_missing: str | None = None
     reference_of: str | None = None
     sees_input: bool = False
 

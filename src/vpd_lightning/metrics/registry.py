@@ -38,9 +38,17 @@ METRICS: tuple[MetricInfo, ...] = (
     ),
     MetricInfo(
         name="flip", title="FLIP", unit="", better="lower", digits=3, subject="image",
-        function="vpd_lightning.metrics.flip.flip_of_images", needs_package="flip-evaluator",
+        function="vpd_lightning.metrics.flip.flip_of_images",
+        why_missing="the package flip-evaluator was not installed",
         description="how different an image looks from the truth when the two alternate (LDR-FLIP), from 0 to 1, at "
         "67 pixels per degree; measured where the package flip-evaluator is installed",
+    ),
+    MetricInfo(
+        name="lpips", title="LPIPS", unit="", better="lower", digits=3, subject="image",
+        function="vpd_lightning.metrics.lpips.lpips_of_images",
+        why_missing="torchvision or its AlexNet weights were not on this machine",
+        description="distance of an image from the truth in the features of AlexNet, weighted as people judged; "
+        "measured where torchvision and its weights are on the machine",
     ),
     MetricInfo(
         name="moving_iou", title="IoU of changed pixels", unit="", better="higher", digits=3, subject="image",
