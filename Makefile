@@ -22,7 +22,7 @@ STAMP := $(VENV)/.installed
 
 export MPLBACKEND = Agg
 
-.PHONY: test-kernels test-benchmarks test-reliability test-documents pages view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-parts test-data test-site test-package test-launchers test-browser test-fast check format format-check lint \
+.PHONY: edit-data test-kernels test-benchmarks test-reliability test-documents pages view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-parts test-data test-site test-package test-launchers test-browser test-fast check format format-check lint \
 	types imports docs cluster bench stability paper-step wheel clean
 
 help: ## List the targets
@@ -68,14 +68,16 @@ VIEW_MODEL ?= released/mujoco_block_demo
 view: $(STAMP) ## Open the browser viewer on a trained model (VIEW_MODEL=released/mujoco_block_demo)
 	$(BIN)/vpd-view ckpt=$(VIEW_MODEL)
 
-EDIT_DATA ?= datasets/deformable_collision_tiny
-editing-figure: $(STAMP) ## Draw the paper's editing figure: no ball, no cube, no floor (needs GL; half a minute)
-	$(BIN)/vpd-data generate scene=deformable_collision preset=tiny out=$(EDIT_DATA) seed=0
-	$(BIN)/python -m docs.results.studies.editing_figure released/deformable_collision_inertial --data $(EDIT_DATA) --start 8 --out $(call NEW_FOLDER,runs/editing_figure)
+EDIT_DATA ?= datasets/deformable_collision_few
+EDIT_MODEL ?= released/deformable_collision_128
+edit-data: $(STAMP)
+	$(BIN)/vpd-data generate scene=deformable_collision preset=paper splits.train=2 splits.validation=1 splits.test=4 out=$(EDIT_DATA) seed=0
 
-novel-view-figure: $(STAMP) ## Draw the paper's novel-view figure: a ring of cameras after 15 steps
-	$(BIN)/vpd-data generate scene=deformable_collision preset=tiny out=$(EDIT_DATA) seed=0
-	$(BIN)/vpd-render ckpt=released/deformable_collision_inertial data.folder=$(EDIT_DATA) freeze_step=15 camera=ring num_views=8 out=$(call NEW_FOLDER,runs/novel_view_figure)
+editing-figure: edit-data ## Draw the paper's editing figure: without one body, the other, the floor (needs GL; 3 minutes)
+	$(BIN)/python -m docs.results.studies.editing_figure $(EDIT_MODEL) --data $(EDIT_DATA) --start 8 --out $(call NEW_FOLDER,runs/editing_figure)
+
+novel-view-figure: edit-data ## Draw the paper's novel-view figure: a ring of cameras after 8 steps, rendered and as particles
+	$(BIN)/python -m docs.results.studies.novel_view_figure $(EDIT_MODEL) --data $(EDIT_DATA) --start 8 --out $(call NEW_FOLDER,runs/novel_view_figure)
 
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL = -n $(WORKERS) --dist loadfile --no-loadscope-reorder
