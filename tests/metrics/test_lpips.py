@@ -118,6 +118,12 @@ def test_one_prediction_stands_for_all_steps(network: nn.Module) -> None:
     assert values.shape == (3, 2) and values[0].abs().max() < 1e-6 and (values[1:] > 0).all()
 
 
+def test_images_that_are_too_small_have_no_value(network: nn.Module) -> None:
+    for size, is_known in ((30, False), (31, True)):
+        truth = images(1, 2)[..., :size, :size, :]
+        assert lpips_of_images(truth, TrueImages(truth)).isnan().all() != is_known
+
+
 def test_without_weights_there_is_no_value_and_nothing_is_fetched(
     made_torchvision: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -29,7 +29,9 @@ SETTINGS = {
     "facing_softness": None,
     "has_scenery": False,
     "num_scenery_candidates": 12,
+    "elliptic_footprints": True,
     "num_lights": 0,
+    "num_occluders": 512,
     "shadow_softness": 0.5,
 }
 BACKENDS = ["torch", pytest.param("numba", marks=pytest.mark.skipif(not find_spec("numba"), reason="needs numba"))]

@@ -6,7 +6,7 @@ import torch
 
 from tests.renderer.test_splat import renderer as plain_renderer
 from vpd_lightning.renderer.shadows import Shadows
-from vpd_lightning.renderer.splat import SplatRenderer, occluders_of
+from vpd_lightning.renderer.splat import SplatRenderer
 from vpd_lightning.types import Occluders, Particles, Rays, Scenery
 
 GRAY, RED, GREEN = [0.4, 0.5, 0.6], [0.9, 0.1, 0.1], [0.1, 0.8, 0.2]
@@ -20,6 +20,7 @@ def renderer(**changes):
             "facing_softness": None,
             "has_scenery": True,
             "num_scenery_candidates": 12,
+            "elliptic_footprints": True,
             "num_lights": 1,
             "shadow_softness": 0.5,
             "candidate_backend": "torch",
@@ -246,21 +247,14 @@ def test_colours_stay_in_range_where_a_shadow_goes_from_a_bright_floor():
     assert rgbs.min() >= 0 and rgbs.max() <= 1
 
 
-def test_occluders_are_packed_moving_particles_of_each_member():
-    states, _ = two_members(num_steps=1)
-    one, other = (member[0] for member in states)
-    moving = torch.stack([torch.arange(40) % 3 == 0, torch.arange(40) % 2 == 0])
-    mask = torch.arange(40).expand(2, 40) > 3
-    both = Particles(
-        torch.cat([one.positions, other.positions]), torch.cat([one.features, other.features]), mask, moving=moving
-    )
-
-    positions, there = occluders_of(both)
-
-    for member in range(2):
-        expected = both.positions[member][moving[member] & mask[member]]
-        assert torch.equal(positions[member][there[member]], expected)
-    assert there.shape[1] == int((moving & mask).sum(dim=1).max())
+def test_a_renderer_reads_as_many_occluders_as_it_says():
+    body, rays = ball(BALL), straight_down(BESIDE)
+    lit = {}
+    for count in (5, 40, 400):
+        model = floor_only(with_side_light(renderer(num_occluders=count)))
+        lit[count] = model(replace(body, scenery=floor()), rays, None).rgbs
+    torch.testing.assert_close(lit[40], lit[400], rtol=0, atol=1e-5)
+    assert not torch.allclose(lit[5], lit[40], atol=1e-3)
 
 
 def test_occluders_that_particles_bring_cast_in_place_of_the_moving_ones():
@@ -371,6 +365,8 @@ def test_gradients_reach_shadows_scenery_and_what_moves_and_are_finite():
         ({"facing_softness": -1.0}, "facing_softness must be positive or null"),
         ({"num_lights": -1}, "num_lights must be at least 0"),
         ({"num_scenery_candidates": 0}, "num_scenery_candidates at least 1"),
+        ({"num_occluders": 0}, "num_occluders from 1 to 2048"),
+        ({"num_occluders": 2049}, "num_occluders from 1 to 2048"),
         ({"has_scenery": False}, "num_lights=1 cast shadows on the scenery"),
         ({"shadow_softness": 0.0}, "softness positive"),
     ],

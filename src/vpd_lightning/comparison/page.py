@@ -30,7 +30,7 @@ _READING = """\
 {metrics}
 - Budget: what a training was allowed; minutes: what it took, by the named clock; both with its pretraining. Steps:
   updates behind the evaluated weights, without those of a pretraining. Ms per picture: wall time of a clip's
-  prediction, from input frames to pictures, over its pictures, on the machine of that evaluation and whatever ran there.
+  prediction, from input frames to pictures, over its pictures, on the machine of that evaluation, with what ran there.
 - `-`: not known, or the system has no such thing."""
 
 

@@ -28,7 +28,11 @@ _ONLY_WITH: dict[str, tuple[str, Callable[[Any], bool], str]] = {
     "generate.preset": ("generate.scene", bool, "the name of a scene"),
     "generate.seed": ("generate.scene", bool, "the name of a scene"),
     "generate.when_missing": ("generate.scene", bool, "the name of a scene"),
+    "renderer.elliptic_footprints": ("renderer.has_scenery", bool, "true"),
     "renderer.num_scenery_candidates": ("renderer.has_scenery", bool, "true"),
+    "light_fit.num_pairs": ("renderer.num_lights", bool, "more than 0"),
+    "light_fit.num_updates": ("renderer.num_lights", bool, "more than 0"),
+    "renderer.num_occluders": ("renderer.num_lights", bool, "more than 0"),
     "renderer.shadow_softness": ("renderer.num_lights", bool, "more than 0"),
     "protocol.long_start_frame": ("protocol.num_long_steps", bool, "more than 0"),
 }

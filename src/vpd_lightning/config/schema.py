@@ -71,6 +71,14 @@ class PretrainingConfig:
 
 
 @dataclass
+class LightFitConfig:
+    """A fit of the renderer's lights before training, to ``num_pairs`` pairs of frames (0: no fit)."""
+
+    num_pairs: int = MISSING
+    num_updates: int = MISSING
+
+
+@dataclass
 class TrainConfig:
     """Root of ``vpd-train``."""
 
@@ -84,6 +92,7 @@ class TrainConfig:
     feature_dim: int = MISSING
     color_features: bool = MISSING
     scenery: bool = MISSING
+    light_fit: LightFitConfig = MISSING
     checkpoint_dynamics: bool = MISSING
     float32_matmul_precision: str = MISSING
     deterministic: bool = MISSING

@@ -13,6 +13,9 @@ from vpd_lightning.metrics.true_images import TrueImages
 _IMAGES_PER_CALL = 64
 """At 128 x 128 pixels the features of as many take about 100 MB."""
 
+_SMALLEST = 31
+"""Pixels on a side; AlexNet has no features of smaller images."""
+
 
 @cache
 def network() -> nn.Module | None:
@@ -49,8 +52,8 @@ def lpips(
 def lpips_of_images(
     pred: Float[Tensor, "step_or_1 view height width 3"], truth: TrueImages
 ) -> Float[Tensor, "step view"]:
-    """LPIPS of every image; NaN where there is no network for it."""
+    """LPIPS of every image; NaN where there is no network for it, or images are too small for it."""
     found = network()
-    if found is None:
+    if found is None or min(truth.colors.shape[2:4]) < _SMALLEST:
         return truth.colors.new_full(truth.colors.shape[:2], torch.nan)
     return lpips(pred.expand_as(truth.colors), truth.colors, found)

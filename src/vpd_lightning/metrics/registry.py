@@ -46,7 +46,7 @@ METRICS: tuple[MetricInfo, ...] = (
     MetricInfo(
         name="lpips", title="LPIPS", unit="", better="lower", digits=3, subject="image",
         function="vpd_lightning.metrics.lpips.lpips_of_images",
-        why_missing="torchvision or its AlexNet weights were not on this machine",
+        why_missing="it needs torchvision, its AlexNet weights, and 31 pixels a side",
         description="distance of an image from the truth in the features of AlexNet, weighted as people judged; "
         "measured where torchvision and its weights are on the machine",
     ),

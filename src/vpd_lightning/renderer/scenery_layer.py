@@ -12,11 +12,15 @@ from vpd_lightning.renderer.kernels.ray_search import RaySearch
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.types import Rays, Scenery
 
-_REACH = 2.0
-"""Pixel widths beside the nearest point up to which a ray still meets its surface."""
+_REACH, _REACH_ELLIPTIC = 2.0, 1.5
+"""Pixel widths beside the nearest point up to which a ray still meets its surface: round, and elliptic footprints."""
+
+_EDGE, _EDGE_ELLIPTIC = 8.0, 16.0
+"""How sharply a surface ends there, per pixel width: between pixels, 0.7 from the nearest, nothing shines through."""
 
 _STEEPEST = 4.0
-"""Most widths that a pixel seen at a grazing angle counts along the surface."""
+"""Most widths that a pixel seen at a grazing angle counts along the surface; twice as many where footprints are
+elliptic."""
 
 
 class SeenScenery(NamedTuple):
@@ -27,18 +31,34 @@ class SeenScenery(NamedTuple):
     opacities: Float[Tensor, "batch ray"]
 
 
+def _seen_beside(
+    offsets: Float[Tensor, "batch ray candidate 3"], views: Float[Tensor, "batch ray candidate 3"]
+) -> Float[Tensor, "batch ray candidate"]:
+    """Return how far beside a point another lies as the camera that saw the point looks at it (metres).
+
+    So what a pixel covers of a surface is as long as it was seen at a grazing angle, and no wider; from the camera
+    that saw it, it is that pixel. At most ``2 * _STEEPEST`` widths long: beyond, distance itself counts.
+    """
+    depth = (offsets * views).sum(dim=-1, keepdim=True)
+    across = (offsets - depth * views).square().sum(dim=-1)
+    far = offsets.square().sum(dim=-1) / (2 * _STEEPEST) ** 2
+    return torch.maximum(across, far).clamp(min=1e-20).sqrt()
+
+
 class SceneryLayer(nn.Module):
     """The mean colour of the ``num_candidates`` points nearest to each ray.
 
     A point counts more the nearer it is to the ray (in widths of the pixel that saw it, times a learned one), the more
     the ray looks the way in which it was seen (a learned angle: reflections and exposure differ between cameras), and
     the finer it was seen; not where it faces away, nor behind another surface. The ray meets the tangent planes of the
-    points, so a floor has its exact depth.
+    points, so a floor has its exact depth. Near is what the camera that saw a point sees near it: the footprint of a
+    pixel is an ellipse on its plane (as in EWA splatting, Zwicker et al. 2001); where not ``elliptic`` it is a disc as
+    wide as that ellipse is long.
     """
 
-    def __init__(self, *, num_candidates: int, near: float, backend: str):
+    def __init__(self, *, num_candidates: int, near: float, backend: str, elliptic: bool):
         super().__init__()
-        self.num_candidates, self.near, self.backend = num_candidates, near, backend
+        self.num_candidates, self.near, self.backend, self.elliptic = num_candidates, near, backend, elliptic
         self.log_width = nn.Parameter(torch.tensor(math.log(0.5)))  # of a pixel
         self.log_angle = nn.Parameter(torch.tensor(math.log(0.2)))  # radians
 
@@ -60,26 +80,32 @@ class SceneryLayer(nn.Module):
         facing = (normals * directions).sum(dim=-1)
         known = normals.square().sum(dim=-1) > 0.5
         usable = usable & ~(known & (facing > 0))
-        grazing = (normals * views).sum(dim=-1).abs().clamp(min=1 / _STEEPEST)
-        reach = sizes / torch.where(known, grazing, 1.0)
         # Where the ray meets the point's tangent plane, as far as that is near the point.
-        slope = torch.where(known & (facing < -0.05), facing, -1.0)
-        planes = (offsets * normals).sum(dim=-1) / slope
-        met = torch.where(known & (facing < -0.05), planes, along)
-        met = along + (met - along).clamp(-4 * _STEEPEST * sizes, 4 * _STEEPEST * sizes)
-        first = (met + 2 * (beside - _REACH * reach).clamp(min=0)).masked_fill(~usable, torch.inf).amin(-1, True)
+        planar = known & (facing < -0.05)
+        planes = (offsets * normals).sum(dim=-1) / torch.where(planar, facing, -1.0)
+        met = torch.where(planar, planes, along)
+        farthest = 4 * _STEEPEST * sizes
+        met = along + (met - along).clamp(-farthest, farthest)
+        if self.elliptic:
+            spread = torch.where(planar, _seen_beside(met[..., None] * directions - offsets, views), beside)
+            reach, most, edge = sizes, _REACH_ELLIPTIC, _EDGE_ELLIPTIC
+        else:
+            grazing = (normals * views).sum(dim=-1).abs().clamp(min=1 / _STEEPEST)
+            spread, reach = beside, sizes / torch.where(known, grazing, 1.0)
+            most, edge = _REACH, _EDGE
+        first = (met + 2 * (spread - most * reach).clamp(min=0)).masked_fill(~usable, torch.inf).amin(-1, True)
         depth = 3 * sizes
         before = nn.functional.logsigmoid((first.clamp(max=1e6) + depth - met) / (0.3 * depth))
         width = sizes * self.log_width.exp()
         turn = 2 - 2 * (views * directions).sum(dim=-1)  # about the square of the angle
-        logits = before - 0.5 * (beside / width).square() - 0.5 * turn * (-2 * self.log_angle).exp() - 2 * sizes.log()
+        logits = before - 0.5 * (spread / width).square() - 0.5 * turn * (-2 * self.log_angle).exp() - 2 * sizes.log()
         logits = logits.masked_fill(~usable, -1e30)
         kernels = decay(logits - logits.detach().amax(dim=-1, keepdim=True)) * usable
         weights = kernels / kernels.sum(dim=-1, keepdim=True).clamp(min=1e-30)
         colors = (weights[:, :, None] @ gather(scenery.colors)).squeeze(2)
         distances = (weights * met).sum(dim=-1)
-        nearest = (beside / reach).masked_fill(~usable, 1e6).amin(dim=-1)
-        return SeenScenery(colors, distances, torch.sigmoid(8 * (_REACH - nearest)))
+        nearest = (spread / reach).masked_fill(~usable, 1e6).amin(dim=-1)
+        return SeenScenery(colors, distances, torch.sigmoid(edge * (most - nearest)))
 
     @torch.no_grad()
     def _candidates(self, scenery: Scenery, rays: Rays) -> Int[Tensor, "batch ray candidate"]:

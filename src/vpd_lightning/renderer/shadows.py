@@ -12,8 +12,8 @@ from vpd_lightning.geometry.decay import NEGLIGIBLE, decay
 from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.types import is_traced
 
-_POINTS_PER_CHUNK = 256
-"""Points at a time: with 512 occluders half a megabyte, which stays in cache."""
+_PAIRS_PER_CHUNK = 2**17
+"""Of points and occluders at a time: half a megabyte, which stays in cache."""
 
 _REACH = 6.0
 """Widths beside an occluder from which on it casts nothing: e^-18 of what it casts where it is."""
@@ -32,8 +32,8 @@ _GONE = -0.3
 """Share of a light that training no longer computes. Of four lights three are below it after some hundred updates, and
 in the trainings looked at none came back from below."""
 
-_POINTS_PER_BLOCK = 16384
-"""Points at a time where all pairs are computed, without gradients: 32 MB with 512 occluders."""
+_PAIRS_PER_BLOCK = 2**23
+"""Of points and occluders at a time where all are computed, without gradients: 32 MB."""
 
 _NUM_BALLS = 8
 """Balls around the occluders of a scene that decide which points to look at: bodies lie apart."""
@@ -93,7 +93,7 @@ class Shadows(nn.Module):
                 covered = _covered_near(points, occluders, mask, beam)
             else:
                 keeps_all = torch.is_grad_enabled() or is_traced()
-                parts = [points] if keeps_all else points.split(_POINTS_PER_BLOCK, dim=1)
+                parts = [points] if keeps_all else points.split(max(1, _PAIRS_PER_BLOCK // mask.shape[1]), dim=1)
                 covered = torch.cat([_covered(part, occluders, mask, beam) for part in parts], dim=1)
             light = light - shares[i] * (covered * beam.height[:, None]).clamp(max=1)[..., None]
         return light.clamp(min=0.05)
@@ -235,7 +235,7 @@ def _covered_near(
         alone = _Beam(beam.direction, beam.reach[some], beam.width[some], beam.slope)
         casting = slice(None) if bool(mask[member].all()) else mask[member]
         weights = alone.shares_of_outline(occluders[some, casting], mask[some, casting])[0]
-        for some in place.split(_POINTS_PER_CHUNK):
+        for some in place.split(max(1, _PAIRS_PER_CHUNK // max(512, len(weights)))):
             chosen = rows[member].index_select(0, some), columns[member][casting]
             begin, end = starts[member].index_select(0, some), ends[member][casting]
             found.append(_KernelSum.apply(*chosen, begin, end, weights, beam.growth))

@@ -9,14 +9,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from vpd_lightning.geometry.decay import decay
-from vpd_lightning.geometry.occluders import occluders_of
+from vpd_lightning.geometry.occluders import MOST_OCCLUDERS, occluders_of, thinned
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.renderer.scenery_layer import SceneryLayer, SeenScenery
 from vpd_lightning.renderer.shadows import Shadows
-from vpd_lightning.types import Particles, Rays, RenderedRays, Scenery, require_finite
+from vpd_lightning.types import Occluders, Particles, Rays, RenderedRays, Scenery, require_finite
 
 _DARKEST = 0.01
 """Colours nearer to 0 or 1 have no logit to add to."""
@@ -42,10 +42,10 @@ class SplatRenderer(AbstractRenderer):
     background alone.
 
     With ``has_scenery`` and particles that have some, the ray shows that behind the moving particles (see
-    ``SceneryLayer``) instead of the background, in the shadows of what moves from ``num_lights`` lights
-    (``Shadows``): its colours are those observed, times the light that reaches them now over the light then. What is
-    deleted or moved takes its shadow along. ``facing_softness`` (a cosine) fades particles whose normals face away from
-    the camera, so that the far side of a body does not shine through; null leaves them.
+    ``SceneryLayer``) instead of the background, in the shadows of what moves (of at most ``num_occluders`` points)
+    from ``num_lights`` lights (``Shadows``): its colours are those observed, times the light that reaches them now over
+    the light then. What is deleted or moved takes its shadow along. ``facing_softness`` (a cosine) fades particles
+    whose normals face away from the camera, so that the far side of a body does not shine through; null leaves them.
 
     ``surface_scale`` is in metres: about as far as a surface reaches beside and behind a particle on it.
     ``kernel_scales`` (widths beside the ray), ``layer_depth`` (along it) and ``shadow_softness`` (before training) are
@@ -73,7 +73,9 @@ class SplatRenderer(AbstractRenderer):
         facing_softness: float | None,
         has_scenery: bool,
         num_scenery_candidates: int,
+        elliptic_footprints: bool,
         num_lights: int,
+        num_occluders: int,
         shadow_softness: float,
     ):
         super().__init__()
@@ -91,10 +93,10 @@ class SplatRenderer(AbstractRenderer):
             )
         if facing_softness is not None and facing_softness <= 0:
             raise ValueError(f"facing_softness must be positive or null, got {facing_softness}")
-        if num_lights < 0 or num_scenery_candidates < 1:
+        if num_lights < 0 or num_scenery_candidates < 1 or not 1 <= num_occluders <= MOST_OCCLUDERS:
             raise ValueError(
-                f"num_lights must be at least 0 and num_scenery_candidates at least 1, got {num_lights} and "
-                f"{num_scenery_candidates}"
+                f"num_lights must be at least 0, num_scenery_candidates at least 1 and num_occluders from 1 to "
+                f"{MOST_OCCLUDERS}, got {num_lights}, {num_scenery_candidates} and {num_occluders}"
             )
         if num_lights and not has_scenery:
             raise ValueError(f"num_lights={num_lights} cast shadows on the scenery: set scenery=true, or num_lights=0")
@@ -123,12 +125,17 @@ class SplatRenderer(AbstractRenderer):
             nn.Linear(3 + 6 * background_frequencies, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, 3)
         )
 
-        self.facing_softness = facing_softness
+        self.facing_softness, self.num_occluders = facing_softness, num_occluders
         self.scenery: SceneryLayer | None = None
         self.shadows: Shadows | None = None
         self._kept: tuple[tuple[Any, ...], tuple[SeenScenery, Tensor, Tensor]] | None = None
         if has_scenery:
-            self.scenery = SceneryLayer(num_candidates=num_scenery_candidates, near=near, backend=candidate_backend)
+            self.scenery = SceneryLayer(
+                num_candidates=num_scenery_candidates,
+                near=near,
+                backend=candidate_backend,
+                elliptic=elliptic_footprints,
+            )
             if num_lights:
                 self.shadows = Shadows(num_lights=num_lights, softness=surface_scale * shadow_softness)
 
@@ -249,7 +256,8 @@ class SplatRenderer(AbstractRenderer):
             seen, points, first = self._unlit(scenery, rays, clip_rays)
             colors = seen.colors
             if self.shadows is not None:
-                now = self.shadows(points.unflatten(1, (repeats, -1)).flatten(0, 1), *occluders_of(particles))
+                casting = thinned(occluders_of(particles), self.num_occluders)
+                now = self.shadows(points.unflatten(1, (repeats, -1)).flatten(0, 1), casting.positions, casting.mask)
                 lit = colors * per_clip(now) / first
                 colors = lit + (lit.clamp(max=1) - lit).detach()  # what is too bright still learns to be less so
             parts = (colors, seen.distances, seen.opacities)
@@ -273,7 +281,8 @@ class SplatRenderer(AbstractRenderer):
         points = clip_rays.origins + seen.distances[..., None] * clip_rays.directions
         first = torch.ones_like(points)
         if self.shadows is not None:
-            first = self.shadows(points, scenery.occluders, scenery.occluder_mask)
+            casting = thinned(Occluders(scenery.occluders, scenery.occluder_mask), self.num_occluders)
+            first = self.shadows(points, casting.positions, casting.mask)
         found = seen, points, first
         self._kept = None if torch.is_grad_enabled() else (key, found)
         return found

@@ -32,10 +32,12 @@ from vpd_lightning.runs.training_errors import (
     plain_interrupt,
 )
 from vpd_lightning.system import AbstractSystem
+from vpd_lightning.training.callbacks.time_budget import TimeBudget
 from vpd_lightning.training.checkpoint_files import LAST
 from vpd_lightning.training.checkpoint_io import AtomicCheckpointIO
 from vpd_lightning.training.checkpoints import FOLDER as CHECKPOINTS
 from vpd_lightning.training.checkpoints import find_resume
+from vpd_lightning.training.light import fit_light_of
 from vpd_lightning.training.module import VPDModule
 from vpd_lightning.training.optimization import AbstractOptimization
 
@@ -103,6 +105,8 @@ def fit(
     callbacks = build_list(config["callbacks"], Callback, "callbacks")
     if first is not None:
         module.remember(hand_over(first, system, datamodule, callbacks, folder, config))
+    elif checkpoint is None and config["light_fit"]["num_pairs"]:
+        _fit_light(system, datamodule, callbacks, config)
     trainer = build(
         config["trainer"],
         Trainer,
@@ -139,6 +143,26 @@ def _fit_background(system: AbstractSystem, datamodule: Any) -> None:
     background = getattr(getattr(system, "encoder", None), "background", None)
     if background is not None and background.needs_fit:
         background.fit(*datamodule.median_background())
+
+
+def _fit_light(
+    system: AbstractSystem, datamodule: Any, callbacks: Sequence[Callback], config: Mapping[str, Any]
+) -> None:
+    """Fit the lights of a new training; the time counts as that of its updates does.
+
+    Raises:
+        ConfigError: it took all the time there is.
+    """
+    clocks = [callback for callback in callbacks if isinstance(callback, TimeBudget)]
+    began = [clock.now() for clock in clocks]
+    fit_light_of(system, datamodule.trajectories, datamodule.input_views, config["seed"], **config["light_fit"])
+    for clock, start in zip(clocks, began, strict=True):
+        clock.seconds += clock.now() - start
+        if clock.seconds_allowed is not None and clock.seconds >= clock.seconds_allowed:
+            raise ConfigError(
+                f"fitting the light took {clock.seconds:.0f} s, all of callbacks.time_budget.minutes={clock.minutes:g}."
+                "\nAllow more, lower light_fit.num_pairs and num_updates, or set light_fit.num_pairs=0."
+            )
 
 
 def _set_numerics(config: dict[str, Any], folder: Path, is_rank_zero: bool) -> None:

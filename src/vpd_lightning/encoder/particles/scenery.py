@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vpd_lightning.types import RGBDFrames, Scenery
+from vpd_lightning.types import Occluders, RGBDFrames, Scenery
 
 
 @torch.no_grad()
@@ -13,8 +13,7 @@ def scenery_of(
     points: Float[Tensor, "batch point 3"],
     normals: Float[Tensor, "batch point 3"],
     still: Bool[Tensor, "batch point"],
-    occluders: Float[Tensor, "batch occluder 3"],
-    occluder_mask: Bool[Tensor, "batch occluder"],
+    occluders: Occluders,
 ) -> Scenery:
     """Return the pixels that stand still (``point`` counts over ``view height width``; metres, world)."""
     cameras, depth = frames.cameras, frames.depth
@@ -30,6 +29,6 @@ def scenery_of(
         views=away / away.norm(dim=-1, keepdim=True).clamp(min=1e-12),
         sizes=sizes,
         mask=still,
-        occluders=occluders,
-        occluder_mask=occluder_mask,
+        occluders=occluders.positions,
+        occluder_mask=occluders.mask,
     )

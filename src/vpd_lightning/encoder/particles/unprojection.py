@@ -140,7 +140,7 @@ class UnprojectingEncoder(AbstractEncoder):
         if not self.has_scenery or purpose == "previous":
             return particles
         assert normals is not None
-        return replace(particles, scenery=scenery_of(frames, everywhere, normals, still, *occluders_of(particles)))
+        return replace(particles, scenery=scenery_of(frames, everywhere, normals, still, occluders_of(particles)))
 
     @torch.no_grad()
     def observe(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> dict[str, Tensor]:
