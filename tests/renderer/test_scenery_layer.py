@@ -130,7 +130,9 @@ def test_rays_see_what_plain_loops_see(seed, elliptic):
     for fast, slow in zip(seen, expected, strict=True):  # float64; sums of 30 terms in another order
         torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-9)
     opacities = expected[2]
-    assert (opacities > 0.9).sum() > 2 and (opacities < 0.9).sum() > 0  # the scene tells hits from misses
+    assert (opacities > 0.9).sum() > (2 if elliptic else 10) and (
+        opacities < 0.9
+    ).sum() > 0  # the scene tells hits from misses
 
 
 def camera(size=16, focal=20.0):
@@ -170,11 +172,12 @@ def test_rays_between_pixels_meet_the_plane_exactly():
     assert seen.opacities.min() > 0.99
 
 
-def test_rays_of_the_pixels_get_their_colours_back():
+@pytest.mark.parametrize(("elliptic", "bound"), [(False, 2e-3), (True, 5e-3)])  # ellipses reach farther up the slope
+def test_rays_of_the_pixels_get_their_colours_back(elliptic, bound):
     scene, _, _ = tilted_plane()
     inner = torch.arange(256).view(16, 16)[2:-2, 2:-2].flatten()
     pixels = torch.stack([inner % 16, inner // 16], dim=-1) + 0.5
-    model = layer(12)
+    model = layer(12, elliptic=elliptic)
     ramp = scene.positions @ torch.tensor([[0.1, 0.2, 0.3], [0.3, -0.1, 0.2], [0.0, 0.1, 0.1]]).double()
     smooth = scenery(scene.positions, ramp, scene.normals, scene.views, scene.sizes)
 
@@ -183,7 +186,7 @@ def test_rays_of_the_pixels_get_their_colours_back():
         model.log_width.fill_(math.log(0.15))
     sharp = model(scene, through(pixels)).colors
 
-    assert (blurred - ramp[:, inner]).abs().max() < 5e-3  # what lies around a pixel evens out
+    assert (blurred - ramp[:, inner]).abs().max() < bound  # what lies around a pixel evens out
     assert (sharp - scene.colors[:, inner]).abs().max() < 1e-4
 
 
