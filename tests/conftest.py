@@ -1,5 +1,6 @@
 """What every test may rely on: a fixed seed, one thread per process, markers that skip what the machine lacks."""
 
+import gc
 import importlib.util
 import os
 import random
@@ -9,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests import fork_server
-from tests.cpu_seconds import pytest_addoption, pytest_configure  # noqa: F401
+from tests import cpu_seconds, fork_server
+from tests.cpu_seconds import pytest_addoption  # noqa: F401
 
 # Tests run in several processes; more threads than cores makes all of them slower. Set before OpenCV or HDF5 load.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -18,9 +19,23 @@ torch.set_num_threads(1)
 
 # The shape checks look for other bytecode while a module of ours is imported, also for what that module imports: these
 # packages would be compiled anew in each test process, which takes ten seconds.
-for _name in ("lightning.pytorch", "torch_geometric", "numba", "scipy.spatial"):
-    if importlib.util.find_spec(_name.partition(".")[0]) is not None:
-        importlib.import_module(_name)
+IMPORTED_BEFORE_OURS = ("lightning.pytorch", "torch_geometric", "numba", "scipy.spatial")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    cpu_seconds.pytest_configure(config)
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        return  # this process hands tests out and runs none
+    for name in IMPORTED_BEFORE_OURS:
+        if importlib.util.find_spec(name.partition(".")[0]) is not None:
+            importlib.import_module(name)
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector the half a million objects that stay, and let it look at the others less often."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
 
 
 def _gl_works() -> bool:

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 import torch
 
-from vpd_lightning.config import build, compose, config_folder
+from tests.composed_options import option_section, options
+from vpd_lightning.config import build, compose
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.encoder.base import AbstractEncoder
 from vpd_lightning.losses.base import AbstractLoss
@@ -89,12 +90,13 @@ DEPARTURES = {
 NEEDS_OBSERVATIONS = {"InertialDynamics"}
 
 
-def options(group: str) -> list[str]:
-    return sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
+GROUPS = ("encoder", "dynamics", "renderer")
 
 
 @cache
 def composed(group: str, option: str) -> Any:
+    if group in GROUPS:
+        return option_section(group, option, GROUPS, SCENE)
     return compose("train", [f"{group}={option}", *SCENE])[group]
 
 

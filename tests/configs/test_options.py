@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.composed_options import option_section, options
 from vpd_lightning.config import build_simulator, check_targets, check_widths, compose, config_folder
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.errors import ConfigError
 
 EXPERIMENTS = sorted(path.stem for path in (config_folder() / "experiment").glob("*.yaml"))
 GROUPS = ("scene", "encoder", "dynamics", "renderer", "optimizer", "trainer", "callbacks", "logger", "protocol")
-OPTIONS = [f"{group}={path.stem}" for group in GROUPS for path in sorted((config_folder() / group).glob("*.yaml"))]
+OPTIONS = [f"{group}={option}" for group in GROUPS for option in options(group)]
 SECTIONS = ("model", "data", "encoder", "dynamics", "renderer", "loss", "optimizer", "trainer", "callbacks", "logger")
 PLACED = ["data.folder=nowhere", "run.folder=nowhere"]
 
@@ -36,14 +37,15 @@ def test_experiment_names_itself_and_its_classes_take_its_arguments(experiment: 
 def test_option_fits_the_class_it_names(option: str):
     if option == "logger=wandb":
         pytest.importorskip("wandb")
-    config = compose("train", [option, *PLACED])
+    group, _, name = option.partition("=")
+    others = [each for each in GROUPS if each != "scene"]  # whose sections refer to that of the scene
+    section = option_section(group, name, ["scene"] if group == "scene" else others, PLACED)
 
-    group = option.partition("=")[0]
-    check_targets(config[group], group)
+    check_targets(section, group)
     if group in ("encoder", "dynamics", "renderer", "optimizer"):  # a value has one home, and that is conf/
-        module, _, name = config[group]["_target_"].rpartition(".")
-        for parameter in inspect.signature(getattr(import_module(module), name)).parameters.values():
-            assert parameter.default is parameter.empty, f"{name}.{parameter.name} has a default"
+        module, _, class_name = section["_target_"].rpartition(".")
+        for parameter in inspect.signature(getattr(import_module(module), class_name)).parameters.values():
+            assert parameter.default is parameter.empty, f"{class_name}.{parameter.name} has a default"
 
 
 @pytest.mark.parametrize("experiment", ["tiny", "demo"])

@@ -40,7 +40,9 @@ def jobs_that_show_every_word(sweep: str, budget: str) -> list[list[str]]:
     """Choose jobs so that each word of the sweep is in one of them: all 28 of table2 would take long to compose."""
     seen: set[str] = set()
     chosen = []
-    for words in expand_sweep("train", [f"sweep={sweep}", f"budget={budget}"]):
+    jobs = jobs_of(f"sweep={sweep}")
+    assert not any(word.startswith("budget=") for words in jobs for word in words)
+    for words in ([*words, f"budget={budget}"] for words in jobs):
         if not seen.issuperset(words):
             chosen.append(words)
         seen.update(words)

@@ -3,15 +3,15 @@
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 
+from tests import composed_options
 from tests.stability.hard_scenes import MODES, Mode
-from vpd_lightning.config import build, compose, config_folder
+from vpd_lightning.config import build
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.encoder.base import AbstractEncoder
 from vpd_lightning.renderer.base import AbstractRenderer
@@ -89,18 +89,16 @@ def variant(group: str, choice: tuple[str, str], mode: Mode, device: torch.devic
 
 def options(group: str) -> list[str]:
     """Return the options of a group; a ``_small`` one is its namesake at another size, and sizes are set here."""
-    names = sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
-    return [name for name in names if not name.endswith("_small")]
+    return [name for name in composed_options.options(group) if not name.endswith("_small")]
 
 
-@cache
 def _composed(group: str, option: str) -> Any:
     scene = [
         "scene=demo", f"feature_dim={FEATURE_DIM}", f"scene.near={NEAR}", f"scene.far={FAR}",
         f"scene.workspace_min={list(WORKSPACE_MIN)}", f"scene.workspace_max={list(WORKSPACE_MAX)}",
         "data.folder=nowhere", "run.folder=nowhere",
     ]  # fmt: skip
-    return compose("train", [f"{group}={option}", *scene])[group]
+    return composed_options.option_section(group, option, tuple(BASES), scene)
 
 
 def _changed(section: Any, scale: float, changes: dict[str, Any]) -> Any:
