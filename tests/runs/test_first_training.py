@@ -22,6 +22,7 @@ from vpd_lightning.training.module import VPDModule
 
 WORDS = ["experiment=mujoco_block", "model=sequential", "budget=tiny", "num_threads=1", "logger=none"]
 SHORT = ["trainer.max_steps=4", "pretraining.settings.trainer.max_steps=3", "trainer.val_check_interval=100"]
+BRIEF = ["protocol.num_trajectories=1", "protocol.num_steps=1", "protocol.num_long_steps=0"]  # of an evaluation
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +36,14 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def train(data: Path, run: Path, *words: str) -> int:
     return main([*WORDS, *SHORT, f"data.folder={data}", f"run.folder={run}", *words])
+
+
+@pytest.fixture(scope="module")
+def whole(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of both trainings, undisturbed; not to be changed."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    assert train(data, run) == 0
+    return run
 
 
 def sequential(**changes: Any) -> dict[str, Any]:
@@ -67,10 +76,10 @@ def test_first_training_gets_its_share_of_the_time() -> None:
 
 
 @pytest.mark.slow
-def test_second_training_starts_from_the_first_and_keeps_what_is_frozen(data: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    assert train(data, run) == 0
-
+def test_second_training_starts_from_the_first_and_keeps_what_is_frozen(
+    data: Path, whole: Path, tmp_path: Path
+) -> None:
+    run = whole
     assert (run / FOLDER / DONE_FILE).is_file()
     first = load_checkpoint(run / FOLDER / "checkpoints" / "last.ckpt")["state_dict"]
     second = load_checkpoint(run / "checkpoints" / "last.ckpt")["state_dict"]
@@ -149,13 +158,14 @@ def test_run_that_ended_between_the_two_trainings_goes_on(data: Path, tmp_path: 
 
 
 @pytest.mark.slow
-def test_run_killed_in_its_first_training_goes_on_there_and_is_evaluated(data: Path, tmp_path: Path) -> None:
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    assert train(data, whole) == 0
+def test_run_killed_in_its_first_training_goes_on_there_and_is_evaluated(
+    data: Path, whole: Path, tmp_path: Path
+) -> None:
+    killed = tmp_path / "killed"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(VPDModule, "on_train_batch_start", dies_at_step(2), raising=False)
         with pytest.raises(RuntimeError, match="killed"):
-            train(data, killed, "callbacks.keep_checkpoints.every_n_steps=1", "evaluate=true")
+            train(data, killed, "callbacks.keep_checkpoints.every_n_steps=1", "evaluate=true", *BRIEF)
     assert not (killed / FOLDER / DONE_FILE).exists() and not (killed / "checkpoints").exists()
 
     assert main([f"resume={killed}"]) == 0

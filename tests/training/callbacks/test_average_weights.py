@@ -157,6 +157,7 @@ def test_what_is_loaded_for_an_evaluation_is_the_average(tmp_path: Path, monkeyp
     folder = tmp_path / "run"
     train.main([
         "experiment=tiny", "callbacks=weight_averaging", "trainer=cpu", "trainer.max_steps=4", "logger=csv",
+        "encoder.num_particles=64", "data.rays_per_step=16",
         "evaluate=false", f"run.folder={folder}",
     ])  # fmt: skip
 
