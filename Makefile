@@ -79,7 +79,8 @@ editing-figure: edit-data ## Draw the paper's editing figure: without one body, 
 novel-view-figure: edit-data ## Draw the paper's novel-view figure: a ring of cameras after 8 steps, rendered and as particles
 	$(BIN)/python -m docs.results.studies.novel_view_figure $(EDIT_MODEL) --data $(EDIT_DATA) --start 8 --out $(call NEW_FOLDER,runs/novel_view_figure)
 
-PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+# Bytecode is kept even where the environment says otherwise: without it each process compiles all modules and all tests.
+PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL = -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 # What has a target of its own: markers, and where the tests that have them lie.
 PARTS = data or site or package or launcher or browser or documents or kernels or benchmarks or reliability
