@@ -30,6 +30,8 @@ def quick(dataset: Path) -> list[str]:
         "experiment=tiny", f"data.folder={dataset}", "trainer.max_steps=2", "trainer.val_check_interval=2",
         "callbacks.keep_checkpoints.every_n_steps=1", "callbacks.draw_rollouts=null", "logger=csv",
         "encoder.num_particles=64", "data.rays_per_step=16", "num_threads=1", "scene.input_views=[0,1,2]",
+        "renderer.net_width=8", "renderer.num_coarse_samples=4", "renderer.num_fine_samples=4",
+        "protocol.num_long_steps=4", "protocol.num_steps=2",
     ]  # fmt: skip
 
 
