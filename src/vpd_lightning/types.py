@@ -84,7 +84,9 @@ class Scenery(_Border):
 
     ``colors`` are as observed (in [0, 1]), shadows included; ``occluders`` are points of what moved at that time, which
     cast them. ``normals`` have unit length, zero where unknown. ``sizes`` is the width of the pixel at the point's
-    distance (metres), ``views`` the unit direction in which it was seen.
+    distance (metres), ``views`` the unit direction in which it was seen. Pixels in ``far_mask`` measured no distance
+    (the sky, what is beyond a sensor's reach): they are no points, ``views`` is the direction in which they were seen
+    and ``sizes`` their width at a metre (radians).
     """
 
     positions: Float[Tensor, "*batch point 3"]
@@ -95,6 +97,11 @@ class Scenery(_Border):
     mask: Bool[Tensor, "*batch point"]
     occluders: Float[Tensor, "*batch occluder 3"]
     occluder_mask: Bool[Tensor, "*batch occluder"]
+    far_mask: _Mask = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.far_mask is None:
+            object.__setattr__(self, "far_mask", torch.zeros_like(self.mask))
 
     def __getitem__(self, index: Any) -> "Scenery":
         return Scenery(**{item.name: getattr(self, item.name)[index] for item in fields(self)})

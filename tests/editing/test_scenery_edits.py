@@ -34,6 +34,7 @@ def scenery(count=300, seed=0):
         mask=(torch.arange(count) < count - 10)[None],
         occluders=torch.rand(1, 6, 3, generator=generator),
         occluder_mask=torch.tensor([[True] * 4 + [False] * 2]),
+        far_mask=(torch.arange(count) >= count - 5)[None],
     )
 
 
@@ -167,9 +168,10 @@ def test_a_copy_of_the_floor_has_its_scenery_and_one_of_a_body_has_none():
     floor = editor.duplicate(CORNER, [0.0, 0.0, 1.5]).scene.current.scenery
     body = editor.duplicate(now == RED, [0.0, 0.0, 1.5]).scene.current.scenery
 
+    names = (*GEOMETRY, "colors", "mask", "far_mask")
     for edited in (floor, body):
-        first = replace(edited, **{name: getattr(edited, name)[:, :300] for name in (*GEOMETRY, "colors", "mask")})
-        assert equal(first, was)
+        assert equal(replace(edited, **{name: getattr(edited, name)[:, :300] for name in names}), was)
+        assert not edited.far_mask[:, 300:].any()  # a copy of a floor brings no second sky
     assert int(floor.mask[:, 300:].sum()) == int(own.sum()) and not body.mask[:, 300:].any()
     copies = floor.positions[:, 300:][floor.mask[:, 300:]]
     expected = was.positions[own] + torch.tensor([0.0, 0.0, 1.5])
@@ -256,7 +258,17 @@ def test_an_edit_with_an_inserted_scene_does_the_same_again(tmp_path):
     assert equal(again.scene.current.scenery, editor.scene.current.scenery)
 
 
-@pytest.mark.parametrize("name", [item.name for item in fields(Scenery)])
+def test_a_scene_that_was_stored_before_there_were_far_pixels_has_none(tmp_path):
+    older = stored(tmp_path)
+    assert older.pop("current_scenery_far_mask").any()
+    np.savez(tmp_path / "older.npz", **older)
+
+    scenery = load_scene(tmp_path / "older.npz").current.scenery
+
+    assert scenery.far_mask.shape == scenery.mask.shape and not scenery.far_mask.any()
+
+
+@pytest.mark.parametrize("name", [item.name for item in fields(Scenery) if item.name != "far_mask"])
 def test_a_stored_scene_that_lacks_a_part_of_its_scenery_is_refused(tmp_path, name):
     changed = stored(tmp_path)
     del changed[f"current_scenery_{name}"]

@@ -5,7 +5,7 @@ import torch
 
 from tests.encoder.test_unet import encoder as plain_encoder
 from tests.encoder.test_unet import fitted_background, frames
-from vpd_lightning.geometry.cameras import project, unproject
+from vpd_lightning.geometry.cameras import pixel_rays, project, unproject
 from vpd_lightning.geometry.normals import depth_normals
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Cameras, RGBDFrames
@@ -145,6 +145,23 @@ def test_pixels_without_a_measurement_are_no_points_and_leave_no_nan(missing):
     assert (scenery.sizes > 0).all()
     lengths = scenery.normals[scenery.mask].norm(dim=-1)
     assert ((lengths - 1).abs() < 1e-5).logical_or(lengths == 0).all()
+
+
+def test_pixels_without_a_measurement_are_far_but_for_those_beside_what_moves():
+    data, closer = with_a_body()
+    closer.depth[0, 1, 1, 1:3] = 0.0  # touches the body
+    closer.depth[0, 1, 6:] = 0.0
+
+    scenery = encoded(encoder(data), closer).scenery
+
+    far = torch.zeros(2, 2, 8, 8, dtype=torch.bool)
+    far[0, 1, 6:] = True
+    assert torch.equal(scenery.far_mask, far.flatten(1)) and not (scenery.far_mask & scenery.mask).any()
+    assert torch.equal(scenery.colors[scenery.far_mask], (data.rgb.float() / 255)[far])
+    directions = pixel_rays(closer.cameras).directions[far]
+    torch.testing.assert_close(scenery.views[scenery.far_mask], directions, rtol=0, atol=1e-6)
+    expected = torch.full_like(scenery.sizes[scenery.far_mask], (8.0 * 12.5) ** -0.5)
+    torch.testing.assert_close(scenery.sizes[scenery.far_mask], expected, rtol=1e-6, atol=0)
 
 
 def test_a_batch_of_scenes_equals_its_members():

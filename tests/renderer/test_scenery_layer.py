@@ -12,7 +12,13 @@ NEAR = 0.1
 
 
 def layer(num_candidates, **changes):
-    settings = {"num_candidates": num_candidates, "near": NEAR, "backend": "torch", "elliptic": True}
+    settings = {
+        "num_candidates": num_candidates,
+        "near": NEAR,
+        "backend": "torch",
+        "elliptic": True,
+        "far_pixels": True,
+    }
     return SceneryLayer(**settings | changes).double()
 
 
@@ -127,7 +133,7 @@ def test_rays_see_what_plain_loops_see(seed, elliptic):
 
     seen, expected = model(scene, rays), plain(model, scene, rays)
 
-    for fast, slow in zip(seen, expected, strict=True):  # float64; sums of 30 terms in another order
+    for fast, slow in zip(seen[:3], expected, strict=True):  # float64; sums of 30 terms in another order
         torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-9)
     opacities = expected[2]
     assert (opacities > 0.9).sum() > (2 if elliptic else 10) and (

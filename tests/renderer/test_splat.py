@@ -30,6 +30,7 @@ SETTINGS = {
     "has_scenery": False,
     "num_scenery_candidates": 12,
     "elliptic_footprints": True,
+    "far_pixels": True,
     "num_lights": 0,
     "num_occluders": 512,
     "shadow_softness": 0.5,

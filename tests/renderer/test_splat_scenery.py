@@ -21,6 +21,7 @@ def renderer(**changes):
             "has_scenery": True,
             "num_scenery_candidates": 12,
             "elliptic_footprints": True,
+            "far_pixels": True,
             "num_lights": 1,
             "shadow_softness": 0.5,
             "candidate_backend": "torch",

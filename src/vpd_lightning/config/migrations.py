@@ -46,6 +46,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "has_scenery": False,
         "num_scenery_candidates": 12,
         "elliptic_footprints": False,
+        "far_pixels": False,
         "num_lights": 0,
         "num_occluders": 512,
         "shadow_softness": 0.5,

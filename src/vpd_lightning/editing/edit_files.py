@@ -190,6 +190,8 @@ def _scenery(path: Path, arrays: Any, frame: str) -> Scenery | None:
     stored = {name: arrays[key] for name in names if (key := f"{frame}_scenery_{name}") in arrays}
     if not stored:
         return None
+    if "far_mask" not in stored and "mask" in stored:  # of versions that had none
+        stored["far_mask"] = np.zeros_like(stored["mask"])
     if missing := [name for name in names if name not in stored]:
         raise EditError(f"{path} is no scene: it lacks {frame}_scenery_{missing[0]}.")
     counts = {name: len(stored["occluders" if name.startswith("occluder") else "positions"][0]) for name in names}

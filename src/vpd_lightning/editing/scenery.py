@@ -21,7 +21,9 @@ def without_scenery(particles: Particles, chosen: Bool[Tensor, " particle"]) -> 
 def only_scenery(particles: Particles, chosen: Bool[Tensor, " particle"]) -> Scenery | None:
     """Return the scenery with the points of the chosen particles alone."""
     scenery = particles.scenery
-    return None if scenery is None else replace(scenery, mask=_points_of(particles, scenery, chosen))
+    if scenery is None:
+        return None
+    return replace(scenery, mask=_points_of(particles, scenery, chosen), far_mask=torch.zeros_like(scenery.far_mask))
 
 
 def transformed_scenery(

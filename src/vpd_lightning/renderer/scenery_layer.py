@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from vpd_lightning.geometry.decay import decay
+from vpd_lightning.renderer.far_pixels import seen_far
 from vpd_lightning.renderer.kernels.ray_search import RaySearch
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.types import Rays, Scenery
@@ -24,11 +25,13 @@ elliptic."""
 
 
 class SeenScenery(NamedTuple):
-    """The scenery along rays, as it was observed; distances in metres."""
+    """The scenery along rays, as it was observed; distances in metres. What is ``far`` lies behind it."""
 
     colors: Float[Tensor, "batch ray 3"]
     distances: Float[Tensor, "batch ray"]
     opacities: Float[Tensor, "batch ray"]
+    far_colors: Float[Tensor, "batch ray 3"]
+    far_opacities: Float[Tensor, "batch ray"]
 
 
 def _seen_beside(
@@ -53,11 +56,13 @@ class SceneryLayer(nn.Module):
     the finer it was seen; not where it faces away, nor behind another surface. The ray meets the tangent planes of the
     points, so a floor has its exact depth. Near is what the camera that saw a point sees near it: the footprint of a
     pixel is an ellipse on its plane (as in EWA splatting, Zwicker et al. 2001); where not ``elliptic`` it is a disc as
-    wide as that ellipse is long.
+    wide as that ellipse is long. With ``far_pixels`` a ray also sees, behind the points, the pixels that measured no
+    distance, in whose direction it leads.
     """
 
-    def __init__(self, *, num_candidates: int, near: float, backend: str, elliptic: bool):
+    def __init__(self, *, num_candidates: int, near: float, backend: str, elliptic: bool, far_pixels: bool):
         super().__init__()
+        self.far_pixels = far_pixels
         self.num_candidates, self.near, self.backend, self.elliptic = num_candidates, near, backend, elliptic
         self.log_width = nn.Parameter(torch.tensor(math.log(0.5)))  # of a pixel
         self.log_angle = nn.Parameter(torch.tensor(math.log(0.2)))  # radians
@@ -105,7 +110,11 @@ class SceneryLayer(nn.Module):
         colors = (weights[:, :, None] @ gather(scenery.colors)).squeeze(2)
         distances = (weights * met).sum(dim=-1)
         nearest = (spread / reach).masked_fill(~usable, 1e6).amin(dim=-1)
-        return SeenScenery(colors, distances, torch.sigmoid(edge * (most - nearest)))
+        opacities = torch.sigmoid(edge * (most - nearest))
+        if not self.far_pixels:
+            return SeenScenery(colors, distances, opacities, torch.zeros_like(colors), torch.zeros_like(opacities))
+        far = seen_far(scenery, rays, self.log_width.exp(), self.backend)
+        return SeenScenery(colors, distances, opacities * far.leaves(nearest), far.colors, far.opacities)
 
     @torch.no_grad()
     def _candidates(self, scenery: Scenery, rays: Rays) -> Int[Tensor, "batch ray candidate"]:

@@ -44,8 +44,10 @@ class SplatRenderer(AbstractRenderer):
     With ``has_scenery`` and particles that have some, the ray shows that behind the moving particles (see
     ``SceneryLayer``) instead of the background, in the shadows of what moves (of at most ``num_occluders`` points)
     from ``num_lights`` lights (``Shadows``): its colours are those observed, times the light that reaches them now over
-    the light then. What is deleted or moved takes its shadow along. ``facing_softness`` (a cosine) fades particles
-    whose normals face away from the camera, so that the far side of a body does not shine through; null leaves them.
+    the light then. What is deleted or moved takes its shadow along. With ``far_pixels`` what lay beyond every measured
+    distance, such as the sky, is drawn behind it as it was seen (``far_pixels.py``). ``facing_softness`` (a cosine)
+    fades particles whose normals face away from the camera, so that the far side of a body does not shine through;
+    null leaves them.
 
     ``surface_scale`` is in metres: about as far as a surface reaches beside and behind a particle on it.
     ``kernel_scales`` (widths beside the ray), ``layer_depth`` (along it) and ``shadow_softness`` (before training) are
@@ -74,6 +76,7 @@ class SplatRenderer(AbstractRenderer):
         has_scenery: bool,
         num_scenery_candidates: int,
         elliptic_footprints: bool,
+        far_pixels: bool,
         num_lights: int,
         num_occluders: int,
         shadow_softness: float,
@@ -135,6 +138,7 @@ class SplatRenderer(AbstractRenderer):
                 near=near,
                 backend=candidate_backend,
                 elliptic=elliptic_footprints,
+                far_pixels=far_pixels,
             )
             if num_lights:
                 self.shadows = Shadows(num_lights=num_lights, softness=surface_scale * shadow_softness)
@@ -177,7 +181,9 @@ class SplatRenderer(AbstractRenderer):
     def _before_scenery(self, particles: Particles, index: Tensor, rays: Rays, seen: SeenScenery) -> RenderedRays:
         """Render moving particles before the scenery: by the network only where a ray passes near one."""
         opacity, distance = seen.opacities[..., None], seen.distances[..., None]
-        behind = opacity * seen.colors + (1 - opacity) * self._background(rays)
+        beyond, background = seen.far_opacities[..., None], self._background(rays)
+        behind = beyond * seen.far_colors + (1 - beyond) * background
+        behind = opacity * seen.colors + (1 - opacity) * behind
         far = opacity * distance + (1 - opacity) * self.far
         rendered = RenderedRays(behind, far.squeeze(-1), seen.opacities)
         is_near = self._passing_near(particles, index, rays).flatten()
@@ -260,7 +266,7 @@ class SplatRenderer(AbstractRenderer):
                 now = self.shadows(points.unflatten(1, (repeats, -1)).flatten(0, 1), casting.positions, casting.mask)
                 lit = colors * per_clip(now) / first
                 colors = lit + (lit.clamp(max=1) - lit).detach()  # what is too bright still learns to be less so
-            parts = (colors, seen.distances, seen.opacities)
+            parts = seen._replace(colors=colors)
             return SeenScenery(*(part.unflatten(1, (repeats, -1)).flatten(0, 1) for part in parts))
 
     def _unlit(self, scenery: Scenery, rays: Rays, clip_rays: Rays) -> tuple[SeenScenery, Tensor, Tensor]:

@@ -109,11 +109,12 @@ class UnprojectingEncoder(AbstractEncoder):
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
         measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
-        moving, still = None, measured
+        moving, still, far = None, measured, ~measured
         if self.background is not None:
             dynamic_mask = self.background(_cropped(frames, candidates))
             moving, border = (pixels.flatten(1) for pixels in _with_border(dynamic_mask))
             candidates, still = candidates & ~border, measured & ~moving & ~border
+            far = far & ~border  # a mixture of a body and what is behind it
         index, valid = self._choose(candidates, moving, keys, purpose)
         normals = None
         if self.use_normals or self.has_scenery:
@@ -140,7 +141,7 @@ class UnprojectingEncoder(AbstractEncoder):
         if not self.has_scenery or purpose == "previous":
             return particles
         assert normals is not None
-        return replace(particles, scenery=scenery_of(frames, everywhere, normals, still, occluders_of(particles)))
+        return replace(particles, scenery=scenery_of(frames, everywhere, normals, still, far, occluders_of(particles)))
 
     @torch.no_grad()
     def observe(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> dict[str, Tensor]:
