@@ -21,8 +21,9 @@ _EDGE = 16.0
 """How sharply that ends, per pixel width."""
 
 _RIM = 0.85
-"""How much nearer in pixel widths, a ray may be to a far pixel than to scenery and still see the scenery: between a
-row of floor and a row of sky, the former ends. Within a surface a ray is at most 0.71 from its nearest point."""
+"""Pixel widths by which a far pixel must be nearer to a ray than the scenery is, to be seen in its place. So a floor ends
+between its last row of pixels and the first row of sky (1 apart); within a surface no ray is more than 0.71 from a
+point."""
 
 
 class SeenFar(NamedTuple):
