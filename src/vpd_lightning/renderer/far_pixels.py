@@ -21,9 +21,9 @@ _EDGE = 16.0
 """How sharply that ends, per pixel width."""
 
 _RIM = 0.85
-"""Pixel widths by which a far pixel must be nearer to a ray than the scenery is, to be seen in its place. So a floor ends
-between its last row of pixels and the first row of sky (1 apart); within a surface no ray is more than 0.71 from a
-point."""
+"""Pixel widths by which a far pixel must be nearer to a ray than the scenery is, to be seen in its place. So a floor
+ends between its last row of pixels and the first row of sky (1 apart); within a surface no ray is more than 0.71 from
+a point."""
 
 
 class SeenFar(NamedTuple):
