@@ -22,7 +22,7 @@ STAMP := $(VENV)/.installed
 
 export MPLBACKEND = Agg
 
-.PHONY: edit-data test-kernels test-benchmarks test-reliability test-documents pages view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-parts test-data test-site test-package test-launchers test-browser test-fast check format format-check lint \
+.PHONY: edit-data test-kernels test-benchmarks test-reliability test-documents pages view editing-figure novel-view-figure audit reliability help setup install demo generate-demo train-demo eval-demo video-demo test test-parts test-exhaustive test-data test-site test-package test-launchers test-browser test-fast check format format-check lint \
 	types imports docs cluster bench stability paper-step wheel clean
 
 help: ## List the targets
@@ -91,10 +91,10 @@ test: $(STAMP) ## Run the tests, but for the parts below; of the stability matri
 	$(PYTEST) $(PARALLEL) -m "not exhaustive and not ($(PARTS))" --durations=15 --durations-min=5 $(PYTEST_ARGS)
 
 test-parts: $(STAMP) ## Run the nine parts below in one go
-	$(PYTEST) $(PARALLEL) $(PARTS_IN) -m "$(PARTS)" --durations=15 --durations-min=5 $(PYTEST_ARGS)
+	$(PYTEST) $(PARALLEL) $(PARTS_IN) -m "not exhaustive and ($(PARTS))" --durations=15 --durations-min=5 $(PYTEST_ARGS)
 
 test-data: $(STAMP) ## Test that data sets are generated and imported, and that each can be trained on (some need GL)
-	$(PYTEST) $(PARALLEL) tests/data_gen tests/integration -m data
+	$(PYTEST) $(PARALLEL) tests/data_gen tests/integration -m "not exhaustive and data"
 
 test-site: $(STAMP) ## Test the pages of docs/ as a site, built strictly
 	$(PYTEST) tests/test_site.py -m site
@@ -112,13 +112,16 @@ test-documents: $(STAMP) ## Test the commands and the Python that README, docs a
 	$(PYTEST) $(PARALLEL) tests/documents tests/examples -m documents
 
 test-kernels: $(STAMP) ## Test the Triton kernels in Triton's interpreter, stability matrix included
-	$(PYTEST) $(PARALLEL) tests/stability/test_interpreter_stability.py tests/renderer tests/graph -m kernels
+	$(PYTEST) $(PARALLEL) tests/stability/test_interpreter_stability.py tests/renderer tests/graph -m "not exhaustive and kernels"
 
 test-benchmarks: $(STAMP) ## Test that every benchmark suite runs and writes its files
 	$(PYTEST) $(PARALLEL) tests/benchmarks -m benchmarks
 
 test-reliability: $(STAMP) ## Test what make reliability tests, in small
 	$(PYTEST) tests/reliability -m reliability
+
+test-exhaustive: $(STAMP) ## Run what `make test` and `make test-parts` leave out (an hour): every case of the matrix, more seeds and scenes
+	$(PYTEST) $(PARALLEL) -m exhaustive $(PYTEST_ARGS)
 
 test-fast: $(STAMP) ## Run the tests that are not marked slow, without parts and stability matrix (under 2 minutes)
 	$(PYTEST) -n $(WORKERS) --dist loadfile -m "not slow and not ($(PARTS))" --ignore=tests/stability

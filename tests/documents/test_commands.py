@@ -33,6 +33,7 @@ TRAINING = (
     "data.num_steps_schedule=null data.rays_per_step=16 encoder.num_particles=64 logger=csv "
     "callbacks.draw_rollouts=null"
 )
+LIGHT = " light_fit.num_pairs=1 light_fit.num_updates=1"  # of model=inertial alone
 EVALUATION = "protocol.num_trajectories=1 protocol.num_steps=2 protocol.num_long_steps=2 num_videos=0"
 FILM = "num_steps=1 height=16 width=16"
 # What runs, in this order, and what is put behind it.
@@ -47,8 +48,8 @@ RUN = {
     "vpd-eval ckpt=released/mujoco_block_demo": EVALUATION,
     "vpd-render ckpt=released/mujoco_block_demo": FILM + " camera=[0]",
     "vpd-train experiment=tiny": TRAINING,
-    "vpd-train experiment=demo": TRAINING + " run.folder=runs/demo/seed0",
-    "vpd-train experiment=demo seed=1": TRAINING,
+    "vpd-train experiment=demo": TRAINING + LIGHT + " run.folder=runs/demo/seed0",
+    "vpd-train experiment=demo seed=1": TRAINING + LIGHT,
     "vpd-train resume=last": "",
     "vpd-eval ckpt=runs/demo/RUN/checkpoints/last.ckpt": EVALUATION,
     "vpd-eval ckpt=FILE 'change={renderer: {ray_chunk_size: 512}}'": EVALUATION,
@@ -63,9 +64,10 @@ RUN = {
     "vpd-data inspect datasets/table": "",
     "vpd-data import recordings/table out=datasets/table height=128": "",
     "vpd-data validate datasets/table": "",
-    "vpd-train experiment=demo generate=null data.folder=datasets/table run.folder=runs/table ": TRAINING,
+    "vpd-train experiment=demo generate=null data.folder=datasets/table run.folder=runs/table ": TRAINING + LIGHT,
     "vpd-eval ckpt=runs/table/checkpoints/last.ckpt": EVALUATION,
-    "vpd-train experiment=demo generate=null data.folder=datasets/table run.folder=runs/table_even_rays ": TRAINING,
+    "vpd-train experiment=demo generate=null data.folder=datasets/table run.folder=runs/table_even_rays ": TRAINING
+    + LIGHT,
     "vpd-train experiment=demo generate=null data.folder=datasets/table run.folder=runs/table_vpd ": TRAINING,
 }
 # What does not run here: how a command begins, and why. The first that fits counts.

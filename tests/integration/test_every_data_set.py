@@ -73,10 +73,10 @@ def test_experiment_learns_from_its_data_set_and_is_evaluated(experiment: str, i
 @pytest.mark.data
 @pytest.mark.gl
 def test_training_makes_its_data_set_in_an_empty_folder(in_folder: Path, capsys: pytest.CaptureFixture[str]):
-    words = ["experiment=deformable_collision", "budget=tiny", "run.folder=run", "num_threads=1"]
+    words = ["experiment=mujoco_block", "budget=tiny", "run.folder=run", "num_threads=1"]
 
     assert train.main([*words, "trainer.max_steps=3", "callbacks.draw_rollouts=null"]) == 0
 
-    assert "making it: vpd-data generate scene=deformable_collision preset=tiny" in capsys.readouterr().out
-    assert (in_folder / "datasets" / "deformable_collision_tiny" / "dataset.json").is_file()
+    assert "making it: vpd-data generate scene=mujoco_block preset=tiny" in capsys.readouterr().out
+    assert (in_folder / "datasets" / "mujoco_block_tiny" / "dataset.json").is_file()
     check_run(in_folder / "run")

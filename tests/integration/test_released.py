@@ -27,6 +27,9 @@ MAX_BYTES = 20_000_000
 STEPS = 2
 LONG = 40
 MOST_PARTICLES = 1024  # of a long rollout
+# One model of each system in `make test`, and of ours the one with all of its scenery as well.
+FIRST = ("mujoco_block_demo", "deformable_collision_128", "mujoco_block_vpd", "movi_a_sequential")
+LONGER = [pytest.param(path, marks=() if path.name in FIRST else pytest.mark.exhaustive) for path in FOLDERS]
 
 
 @pytest.fixture(params=FOLDERS, ids=lambda path: path.name)
@@ -67,6 +70,7 @@ def test_it_predicts(folder: Path) -> None:
     assert count == json.loads((folder / "release.json").read_text())["num_parameters"]
 
 
+@pytest.mark.parametrize("folder", LONGER, ids=[path.name for path in FOLDERS], indirect=True)
 def test_it_says_the_same_in_float64_and_stays_finite(folder: Path) -> None:
     model = loaded(folder)
     past, views = model.simulator.num_context_frames, model.input_views
