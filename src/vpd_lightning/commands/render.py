@@ -43,7 +43,7 @@ def _render(config: Mapping[str, Any]) -> None:
     set_threads(config["num_threads"])
     operations = load_edit(config["edit"]) if config["edit"] is not None else []
     model = load_particle_simulator(config)
-    manifest = data_set(config["data"]["folder"], model.config)
+    manifest = data_set(config["data"]["folder"], model.config, only=(config["split"], config["trajectory"]))
     path = choose_trajectory(manifest, config["split"], config["trajectory"])
     start, freeze_step = config["start_frame"], config["freeze_step"]
     clip = render_rollout.read_context(path, start)

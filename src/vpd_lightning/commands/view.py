@@ -69,7 +69,7 @@ def _show(viewer: Any, config: Mapping[str, Any]) -> None:
 
     set_threads(config["num_threads"])
     model = load_particle_simulator(config)
-    manifest = data_set(config["data"]["folder"], model.config)
+    manifest = data_set(config["data"]["folder"], model.config, only=(config["split"], config["trajectory"]))
     path = choose_trajectory(manifest, config["split"], config["trajectory"])
     start_frame = config["start_frame"]
     title = f"{model.name}, {manifest.relative(path)}, frame {start_frame}"

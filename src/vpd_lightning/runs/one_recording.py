@@ -27,10 +27,13 @@ def load_particle_simulator(config: Mapping[str, Any]) -> LoadedModel:
     return model
 
 
-def data_set(folder: str | None, config: Mapping[str, Any]) -> Manifest:
-    """Return the data set asked for, or that of the training, which is made anew where the training would make it."""
+def data_set(folder: str | None, config: Mapping[str, Any], only: tuple[str, int] | None = None) -> Manifest:
+    """Return the data set asked for, or that of the training, which is made anew where the training would make it.
+
+    Where one trajectory (split, number) is all that is needed, ``only`` it is made.
+    """
     if folder is None and (config.get("generate") or {}).get("when_missing"):
-        provide_data(config)
+        return load_manifest(provide_data(config, only=only))
     return load_manifest(data_folder(folder, config))
 
 

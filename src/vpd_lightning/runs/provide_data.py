@@ -2,28 +2,40 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from vpd_lightning.data.manifest import FILE_NAME, did_you_mean, load_manifest
-from vpd_lightning.errors import DataError
+from vpd_lightning.errors import ConfigError, DataError
 
 _HOME = "datasets"
 """Where the data sets of our experiments lie, each called after its experiment or scene, and its preset."""
 
 
-def provide_data(config: Mapping[str, Any], overrides: Sequence[str] | None = None) -> None:
+def provide_data(
+    config: Mapping[str, Any], overrides: Sequence[str] | None = None, only: tuple[str, int] | None = None
+) -> Path:
     """Generate the data set of a training's configuration where it is missing and ``generate.when_missing`` is true.
 
     A folder that was given by name is not filled: it may be a mistyped one. What was given by name, ``overrides`` say
     (the words of the command line); where they are not known, every folder but the experiment's own counts as given.
+
+    Args:
+        config: of a training.
+        overrides: the words of the command line.
+        only: a split and the number of the one trajectory of it that is needed. A missing data set is then not made
+            whole, but as far as that trajectory, in a folder of its own beside it; a trajectory is the same in both.
+
+    Returns:
+        The folder of the data set.
 
     Raises:
         DataError: it is missing, and nothing makes it here.
     """
     folder, wanted = Path(config["data"]["folder"]), config.get("generate")
     if (folder / FILE_NAME).is_file():
-        return
+        return folder
     missing = f"there is no data set in {folder} (no {FILE_NAME}).{did_you_mean(folder)}"
     if wanted is None or wanted["scene"] is None:
         raise DataError(
@@ -42,10 +54,32 @@ def provide_data(config: Mapping[str, Any], overrides: Sequence[str] | None = No
         )
     if int(os.environ.get("LOCAL_RANK", "0")) > 0:
         raise DataError(f"there is no data set in {folder}.\nMake it before training on several devices: {command}")
+    settings = {"scene": wanted["scene"], "preset": wanted["preset"], "seed": wanted["seed"]}
+    if only is not None:
+        return _provide_one(folder, settings, *only)
     from data_gen.generate import generate
 
     print(f"there is no data set in {folder}; making it: {command}", flush=True)
-    generate(scene=wanted["scene"], preset=wanted["preset"], out=folder, seed=wanted["seed"])
+    return generate(**settings, out=folder)
+
+
+def _provide_one(whole: Path, settings: dict[str, Any], split: str, number: int) -> Path:
+    """Generate a split as far as one trajectory, in a folder called after both, unless it is there."""
+    from data_gen.generate import generate, make_plan
+
+    counts = asdict(make_plan(out=whole, overrides={}, **settings).settings.splits)
+    if not 0 <= number < counts.get(split, 0):
+        has = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise ConfigError(
+            f"There is no trajectory {number} in split {split}.\nThe data set has, counted from 0: {has}."
+        )
+    folder = whole.with_name(f"{whole.name}_{split}_{number + 1}")
+    if not (folder / FILE_NAME).is_file():
+        sizes = {f"splits.{name}": (number + 1) * (name == split) for name in counts}
+        words = " ".join(f"{name}={value}" for name, value in (settings | sizes | {"out": folder}).items())
+        print(f"there is no data set in {whole}; making what is shown of it: vpd-data generate {words}", flush=True)
+        generate(**settings, out=folder, overrides=sizes)
+    return folder
 
 
 def require_trusted_data(config: Mapping[str, Any]) -> None:
