@@ -160,9 +160,11 @@ def test_a_data_set_that_is_gone_is_made_again_where_the_training_would_make_it(
     checkpoint = write_untrained(tmp_path / "run", gone, *words)
     asked: list[Path] = []
 
-    def provide(config: Mapping[str, Any]) -> None:
+    def provide(config: Mapping[str, Any], only: tuple[str, int] | None) -> Path:
+        assert only is None  # an evaluation needs the whole set
         asked.append(Path(config["data"]["folder"]))
         gone.symlink_to(data)
+        return gone
 
     monkeypatch.setattr("vpd_lightning.runs.one_recording.provide_data", provide)
     code = main([f"ckpt={checkpoint}", "num_videos=0", "protocol.num_trajectories=1", "protocol.num_long_steps=0"])

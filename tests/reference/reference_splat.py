@@ -43,7 +43,7 @@ def _ray(
     direction: Array,
 ) -> list[float]:
     """Return red, green, blue, depth and opacity of one ray; ``positions`` and ``features`` hold no padding."""
-    waves = [np.exp(1j * np.pi * 2**octave * direction) for octave in range(renderer.background_frequencies)]
+    waves = [np.exp(1j * np.pi * 2**octave * direction) for octave in range(renderer.background.frequencies)]
     encoded = np.concatenate([direction, *(part for wave in waves for part in (wave.imag, wave.real))])
     behind_all = _sigmoid(_evaluate(background, encoded))
     offsets = positions - origin

@@ -53,8 +53,7 @@ def layer(**changes):
 
 def shown(seen):
     """Colours in front of black."""
-    behind = seen.far_opacities[..., None] * seen.far_colors
-    return seen.opacities[..., None] * seen.colors + (1 - seen.opacities[..., None]) * behind
+    return seen.opacities[..., None] * seen.colors + (1 - seen.opacities[..., None]) * seen.behind
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])
@@ -117,7 +116,8 @@ def test_without_a_far_pixel_nothing_changes_and_what_was_not_seen_is_left_to_th
     for one, other in zip(layer()(none, rays), layer(far_pixels=False)(none, rays), strict=True):
         assert torch.equal(one, other)
     down = Rays(rays.origins, tensor([0.0, -1.0, 0.0]).expand_as(rays.directions))
-    assert layer()(scenery, down).far_opacities.max() < 1e-6
+    background = torch.rand(down.origins.shape, dtype=torch.float64)
+    torch.testing.assert_close(layer()(scenery, down, background).behind, background, rtol=0, atol=1e-6)
 
 
 def test_a_renderer_draws_the_sky_behind_a_body_and_the_same_without_one():
@@ -142,6 +142,6 @@ def test_the_width_of_a_pixel_learns_from_the_sky():
     model = layer()
     turned = torch.nn.functional.normalize(rays.directions + 0.4 / FOCAL, dim=-1)
 
-    model(scenery, Rays(rays.origins, turned)).far_colors.sum().backward()
+    model(scenery, Rays(rays.origins, turned)).behind.sum().backward()
 
     assert model.log_width.grad is not None and torch.isfinite(model.log_width.grad) and model.log_width.grad != 0

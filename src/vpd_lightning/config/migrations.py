@@ -47,6 +47,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "num_scenery_candidates": 12,
         "elliptic_footprints": False,
         "far_pixels": False,
+        "unseen_ground": False,
         "num_lights": 0,
         "num_occluders": 512,
         "shadow_softness": 0.5,

@@ -25,13 +25,12 @@ elliptic."""
 
 
 class SeenScenery(NamedTuple):
-    """The scenery along rays, as it was observed; distances in metres. What is ``far`` lies behind it."""
+    """The scenery along rays, as it was observed, and what is ``behind`` it; distances in metres."""
 
     colors: Float[Tensor, "batch ray 3"]
     distances: Float[Tensor, "batch ray"]
     opacities: Float[Tensor, "batch ray"]
-    far_colors: Float[Tensor, "batch ray 3"]
-    far_opacities: Float[Tensor, "batch ray"]
+    behind: Float[Tensor, "batch ray 3"]
 
 
 def _seen_beside(
@@ -67,8 +66,10 @@ class SceneryLayer(nn.Module):
         self.log_width = nn.Parameter(torch.tensor(math.log(0.5)))  # of a pixel
         self.log_angle = nn.Parameter(torch.tensor(math.log(0.2)))  # radians
 
-    def forward(self, scenery: Scenery, rays: Rays) -> SeenScenery:
-        """Look along the rays (``batch ray 3``, the scenery's batch axis)."""
+    def forward(
+        self, scenery: Scenery, rays: Rays, background: Float[Tensor, "batch ray 3"] | None = None
+    ) -> SeenScenery:
+        """Look along the rays (``batch ray 3``, the scenery's batch axis), before a background: black if not given."""
         index = self._candidates(scenery, rays)
         batch = torch.arange(len(index), device=index.device)[:, None, None]
         flat = (batch * scenery.positions.shape[1] + index.clamp(min=0)).flatten()
@@ -111,10 +112,14 @@ class SceneryLayer(nn.Module):
         distances = (weights * met).sum(dim=-1)
         nearest = (spread / reach).masked_fill(~usable, 1e6).amin(dim=-1)
         opacities = torch.sigmoid(edge * (most - nearest))
+        if background is None:
+            background = torch.zeros_like(colors)
         if not self.far_pixels:
-            return SeenScenery(colors, distances, opacities, torch.zeros_like(colors), torch.zeros_like(opacities))
+            return SeenScenery(colors, distances, opacities, background)
         far = seen_far(scenery, rays, self.log_width.exp(), self.backend)
-        return SeenScenery(colors, distances, opacities * far.leaves(nearest), far.colors, far.opacities)
+        beyond = far.opacities[..., None]
+        behind = beyond * far.colors + (1 - beyond) * background
+        return SeenScenery(colors, distances, opacities * far.leaves(nearest), behind)
 
     @torch.no_grad()
     def _candidates(self, scenery: Scenery, rays: Rays) -> Int[Tensor, "batch ray candidate"]:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from vpd_lightning.geometry.decay import decay
 from vpd_lightning.geometry.occluders import MOST_OCCLUDERS, occluders_of, thinned
 from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.renderer.background import Background, UnseenGround
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
@@ -20,6 +21,9 @@ from vpd_lightning.types import Occluders, Particles, Rays, RenderedRays, Scener
 
 _DARKEST = 0.01
 """Colours nearer to 0 or 1 have no logit to add to."""
+
+_GROUND_LENGTH = 20.0
+"""Surface scales within which a place on the ground is told from others; beyond, less and less."""
 
 
 class _Layers(NamedTuple):
@@ -45,9 +49,9 @@ class SplatRenderer(AbstractRenderer):
     ``SceneryLayer``) instead of the background, in the shadows of what moves (of at most ``num_occluders`` points)
     from ``num_lights`` lights (``Shadows``): its colours are those observed, times the light that reaches them now over
     the light then. What is deleted or moved takes its shadow along. With ``far_pixels`` what lay beyond every measured
-    distance, such as the sky, is drawn behind it as it was seen (``far_pixels.py``). ``facing_softness`` (a cosine)
-    fades particles whose normals face away from the camera, so that the far side of a body does not shine through;
-    null leaves them.
+    distance, such as the sky, is drawn behind it as it was seen (``far_pixels.py``), and with ``unseen_ground`` the
+    floor goes on where no input camera saw it (``background.py``). ``facing_softness`` (a cosine) fades particles whose
+    normals face away from the camera, so that the far side of a body does not shine through; null leaves them.
 
     ``surface_scale`` is in metres: about as far as a surface reaches beside and behind a particle on it.
     ``kernel_scales`` (widths beside the ray), ``layer_depth`` (along it) and ``shadow_softness`` (before training) are
@@ -77,6 +81,7 @@ class SplatRenderer(AbstractRenderer):
         num_scenery_candidates: int,
         elliptic_footprints: bool,
         far_pixels: bool,
+        unseen_ground: bool,
         num_lights: int,
         num_occluders: int,
         shadow_softness: float,
@@ -122,15 +127,11 @@ class SplatRenderer(AbstractRenderer):
         if color_features:  # before training, a layer has the mean colour of its particles
             with torch.no_grad():
                 last.weight[:6], last.bias[:6] = 0, 0
-        # Octaves of the direction, as in NeRF: what lies outside of the workspace has detail, too.
-        self.background_frequencies = background_frequencies
-        self.background = nn.Sequential(
-            nn.Linear(3 + 6 * background_frequencies, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, 3)
-        )
-
+        self.background = Background(frequencies=background_frequencies, hidden_dim=hidden_dim)
         self.facing_softness, self.num_occluders = facing_softness, num_occluders
         self.scenery: SceneryLayer | None = None
         self.shadows: Shadows | None = None
+        self.unseen_ground: UnseenGround | None = None
         self._kept: tuple[tuple[Any, ...], tuple[SeenScenery, Tensor, Tensor]] | None = None
         if has_scenery:
             self.scenery = SceneryLayer(
@@ -142,6 +143,13 @@ class SplatRenderer(AbstractRenderer):
             )
             if num_lights:
                 self.shadows = Shadows(num_lights=num_lights, softness=surface_scale * shadow_softness)
+            if unseen_ground:
+                self.unseen_ground = UnseenGround(
+                    frequencies=background_frequencies,
+                    hidden_dim=hidden_dim,
+                    length=surface_scale * _GROUND_LENGTH,
+                    near=near,
+                )
 
     def forward(self, particles: Particles, rays: Rays, keys: RandomKeys | None) -> RenderedRays:
         """Render rays (``batch ray 3``); nothing here is random, so ``keys`` is not used.
@@ -175,15 +183,13 @@ class SplatRenderer(AbstractRenderer):
             lines = Rays(rays.origins[:, some], rays.directions[:, some])
             layers = self._rendered_layers(particles, index[:, some], lines, has_scenery=False)
             far = torch.full_like(layers.distances[..., :1], self.far)
-            chunks.append(_composited(layers, self._background(lines), far, torch.zeros_like(far)))
+            chunks.append(_composited(layers, self.background(lines.directions), far, torch.zeros_like(far)))
         return _joined(chunks)
 
     def _before_scenery(self, particles: Particles, index: Tensor, rays: Rays, seen: SeenScenery) -> RenderedRays:
         """Render moving particles before the scenery: by the network only where a ray passes near one."""
         opacity, distance = seen.opacities[..., None], seen.distances[..., None]
-        beyond, background = seen.far_opacities[..., None], self._background(rays)
-        behind = beyond * seen.far_colors + (1 - beyond) * background
-        behind = opacity * seen.colors + (1 - opacity) * behind
+        behind = opacity * seen.colors + (1 - opacity) * seen.behind
         far = opacity * distance + (1 - opacity) * self.far
         rendered = RenderedRays(behind, far.squeeze(-1), seen.opacities)
         is_near = self._passing_near(particles, index, rays).flatten()
@@ -227,9 +233,6 @@ class SplatRenderer(AbstractRenderer):
 
     def _chunks(self, num_rays: int) -> list[slice]:
         return [slice(s, s + self.ray_chunk_size) for s in range(0, max(num_rays, 1), self.ray_chunk_size)]
-
-    def _background(self, rays: Rays) -> Float[Tensor, "batch ray 3"]:
-        return torch.sigmoid(self.background(self._encoded(rays.directions)).to(rays.origins.dtype))
 
     def _rendered_layers(self, particles: Particles, index: Tensor, rays: Rays, has_scenery: bool) -> _Layers:
         """Return what the network makes of the front and the back layer of each ray."""
@@ -275,7 +278,8 @@ class SplatRenderer(AbstractRenderer):
         Without gradients it is kept for the next call: a camera that stands still sees the same at every step.
         """
         assert self.scenery is not None
-        weights = [p for part in (self.scenery, self.shadows) if part is not None for p in part.parameters()]
+        parts = (self.scenery, self.shadows, self.background, self.unseen_ground)
+        weights = [weight for part in parts if part is not None for weight in part.parameters()]
         held = [scenery, rays.origins, rays.directions]
         read = [*weights, *held[1:], *(getattr(scenery, item.name) for item in fields(scenery))]
         key = held, [tensor.dtype for tensor in read], [0 if t.is_inference() else t._version for t in read]
@@ -283,7 +287,10 @@ class SplatRenderer(AbstractRenderer):
             kept, found = self._kept
             if all(one is other for one, other in zip(held, kept[0], strict=True)) and key[1:] == kept[1:]:
                 return found
-        seen = self.scenery(scenery, clip_rays)
+        background = self.background(clip_rays.directions)
+        if self.unseen_ground is not None:
+            background = self.unseen_ground(scenery, clip_rays, background)
+        seen = self.scenery(scenery, clip_rays, background)
         points = clip_rays.origins + seen.distances[..., None] * clip_rays.directions
         first = torch.ones_like(points)
         if self.shadows is not None:
@@ -301,10 +308,6 @@ class SplatRenderer(AbstractRenderer):
         num_scales = len(self.kernel_scales)
         visible = inputs.unflatten(-1, (2, -1))[..., :-1].unflatten(-1, (num_scales, -1))[..., num_scales // 2, -1]
         return 3.0 + 20.0 * visible
-
-    def _encoded(self, directions: Tensor) -> Float[Tensor, "batch ray channel"]:
-        octaves = [directions * (torch.pi * 2**octave) for octave in range(self.background_frequencies)]
-        return torch.cat([directions, *(wave(angle) for angle in octaves for wave in (torch.sin, torch.cos))], dim=-1)
 
     def _layers(
         self, particles: Particles, index: Tensor, origins: Tensor, directions: Tensor
