@@ -62,7 +62,7 @@ def _train_as_told(arguments: Arguments) -> int:
     from vpd_lightning.config import compose_with_folder, expand_sweep
     from vpd_lightning.runs.resume import resumed_overrides, wants_auto
 
-    overrides = resumed_overrides(arguments.overrides)
+    overrides = resumed_overrides(arguments.overrides, arguments.config_dir)
     jobs = expand_sweep("train", overrides, arguments.config_dir) if arguments.is_multirun else [overrides]
     composed = [compose_with_folder(words, arguments.config_dir, _NOT_CHOSEN) for words in jobs]
     configs = [config for config, _, _ in composed]

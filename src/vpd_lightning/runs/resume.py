@@ -1,18 +1,25 @@
 """``resume=...``: which run to go on with, and with which settings."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
 
+from vpd_lightning.config.migrations import ADDED_SETTINGS
 from vpd_lightning.errors import CheckpointError, ConfigError
+from vpd_lightning.moved import current_name
 
 OVERRIDES_FILE = "overrides.yaml"
+CONFIG_FILE = "config.yaml"
 
 
-def resumed_overrides(overrides: Sequence[str]) -> list[str]:
+def resumed_overrides(overrides: Sequence[str], config_dir: str | Path | None = None) -> list[str]:
     """Return the overrides of the run to go on with, followed by the new ones; without ``resume``, the given ones.
+
+    Settings that came after the run began are added as they were without them, for its weights are those of a model
+    that has not got them.
 
     ``resume=FOLDER`` names a run folder, ``resume=last`` the latest one (of the experiment, where one is given),
     ``resume=auto`` goes on with ``run.folder`` where that holds a checkpoint and starts it otherwise (the caller makes
@@ -43,7 +50,37 @@ def resumed_overrides(overrides: Sequence[str]) -> list[str]:
         )
     merged = _as_mapping([*_saved_overrides(folder), *overrides])
     merged["resume"] = merged["run.folder"] = quote(str(folder.absolute()))
-    return [f"{key}={value}" for key, value in merged.items()]
+    words = [f"{key}={value}" for key, value in merged.items()]
+    later = {key: value for key, value in _later_settings(_saved_config(folder)) if key not in merged}
+    if later:  # composing takes half a second
+        from vpd_lightning.config import compose
+
+        composed = compose("train", words, config_dir)
+        words += [f"{key}={_word(value)}" for key, value in later.items() if _value(composed, key, value) != value]
+    return words
+
+
+def _later_settings(config: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield what a stored configuration of an older version lacks, with the value that leaves its model as it was."""
+    for name, section in config.items():
+        if isinstance(section, Mapping):
+            yield from _later_settings(section, f"{where}{name}.")
+            for key, value in ADDED_SETTINGS.get(current_name(str(section.get("_target_"))), {}).items():
+                if key not in section:
+                    yield f"{where}{name}.{key}", value
+
+
+def _value(config: Any, key: str, default: Any) -> Any:
+    """Return the value of a dotted key; the default where there is no such key."""
+    for name in key.split("."):
+        if not isinstance(config, Mapping) or name not in config:
+            return default
+        config = config[name]
+    return config
+
+
+def _word(value: Any) -> str:
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def wants_auto(overrides: Sequence[str]) -> bool:
@@ -107,6 +144,15 @@ def _saved_overrides(folder: Path) -> list[str]:
     if not isinstance(words, list) or not all(isinstance(word, str) and "=" in word for word in words):
         raise CheckpointError(f"{path} is not a list of overrides.\nRestore the file, or start anew.")
     return words
+
+
+def _saved_config(folder: Path) -> Mapping[str, Any]:
+    """Return the configuration with which the run began; empty where there is none to read."""
+    try:
+        config = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError, UnicodeDecodeError):
+        return {}
+    return config if isinstance(config, Mapping) else {}
 
 
 def _unquote(value: str) -> str:
