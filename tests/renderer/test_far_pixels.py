@@ -47,7 +47,14 @@ def outdoors(sky=SKY):
 
 
 def layer(**changes):
-    settings = {"num_candidates": 12, "near": 0.1, "backend": "torch", "elliptic": True, "far_pixels": True}
+    settings = {
+        "num_candidates": 12,
+        "near": 0.1,
+        "backend": "torch",
+        "elliptic": True,
+        "far_pixels": True,
+        "far_goes_on": False,
+    }
     return SceneryLayer(**settings | changes).double()
 
 
@@ -133,6 +140,27 @@ def test_a_renderer_draws_the_sky_behind_a_body_and_the_same_without_one():
     assert not alone.opacities[0, : 4 * SIZE].gt(1e-3).any()  # nothing is there: depth is that of the far end
     hidden = (before.rgbs - alone.rgbs).abs().amax(dim=-1)[0] > 0.2
     assert 1 <= hidden[: HORIZON * SIZE].sum() < 5 * SIZE
+
+
+def test_the_sky_goes_on_where_a_body_stood_before_it_but_not_into_the_floor():
+    scenery, rays = outdoors()
+    covered = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    covered[1:5, 6:10] = True  # by a body, when it was observed
+    covered = covered.flatten()
+    scenery = Scenery(**{**vars(scenery), "far_mask": scenery.far_mask & ~covered})
+    empty = ball([0.0, 1.0, 1.2])
+    empty = Particles(empty.positions, empty.features, mask=empty.mask & False, moving=empty.moving, scenery=scenery)
+    torch.manual_seed(0)
+    plain, going_on = renderer(num_lights=0), renderer(num_lights=0, unseen_ground=True)
+    going_on.load_state_dict(plain.state_dict(), strict=False)
+
+    before, after = (model(empty, rays, None).rgbs[0] for model in (plain, going_on))
+
+    assert (before[covered] - tensor(SKY)).abs().max() > 0.1
+    assert (after[covered] - tensor(SKY)).abs().max() < 0.02
+    torch.testing.assert_close(after[~covered], before[~covered], rtol=0, atol=0.02)
+    down = Rays(rays.origins, tensor([0.0, 0.6, -0.8]).expand_as(rays.directions))  # below the picture: unseen floor
+    assert (going_on(empty, down, None).rgbs - tensor(GRAY)).abs().max() < 0.02
 
 
 def test_the_width_of_a_pixel_learns_from_the_sky():

@@ -26,6 +26,10 @@ ends between its last row of pixels and the first row of sky (1 apart); within a
 a point."""
 
 
+_GOES_ON = 16.0
+"""Pixel widths over which a sky fades beyond its last pixel: what stands before it covers as much."""
+
+
 class SeenFar(NamedTuple):
     """What far pixels show along rays; ``nearest`` is the angle to the closest of them, in its pixel's widths."""
 
@@ -36,6 +40,15 @@ class SeenFar(NamedTuple):
     def leaves(self, nearest: Float[Tensor, "batch ray"]) -> Float[Tensor, "batch ray"]:
         """Return how much of the scenery is seen whose closest point is ``nearest`` away (pixel widths)."""
         return torch.sigmoid(_EDGE * (self.nearest + _RIM - nearest))
+
+    def going_on(self, nearest: Float[Tensor, "batch ray"]) -> Float[Tensor, "batch ray"]:
+        """Return how much of a ray that meets nothing that was seen shows their colour: what a body stood before.
+
+        That is where they are nearer to the ray than the scenery, whose closest point is ``nearest`` away (pixel
+        widths); farther away less and less.
+        """
+        share = decay(-0.5 * (self.nearest / _GOES_ON).square())
+        return share * torch.sigmoid((nearest - self.nearest).clamp(-50, 50))
 
 
 def seen_far(scenery: Scenery, rays: Rays, width: Float[Tensor, ""], backend: str) -> SeenFar:

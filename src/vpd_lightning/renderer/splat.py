@@ -50,8 +50,9 @@ class SplatRenderer(AbstractRenderer):
     from ``num_lights`` lights (``Shadows``): its colours are those observed, times the light that reaches them now over
     the light then. What is deleted or moved takes its shadow along. With ``far_pixels`` what lay beyond every measured
     distance, such as the sky, is drawn behind it as it was seen (``far_pixels.py``), and with ``unseen_ground`` the
-    floor goes on where no input camera saw it (``background.py``). ``facing_softness`` (a cosine) fades particles whose
-    normals face away from the camera, so that the far side of a body does not shine through; null leaves them.
+    floor and the sky go on where no input camera saw them (``background.py``). ``facing_softness`` (a cosine) fades
+    particles whose normals face away from the camera, so that the far side of a body does not shine through; null
+    leaves them.
 
     ``surface_scale`` is in metres: about as far as a surface reaches beside and behind a particle on it.
     ``kernel_scales`` (widths beside the ray), ``layer_depth`` (along it) and ``shadow_softness`` (before training) are
@@ -140,6 +141,7 @@ class SplatRenderer(AbstractRenderer):
                 backend=candidate_backend,
                 elliptic=elliptic_footprints,
                 far_pixels=far_pixels,
+                far_goes_on=unseen_ground,
             )
             if num_lights:
                 self.shadows = Shadows(num_lights=num_lights, softness=surface_scale * shadow_softness)
