@@ -124,7 +124,7 @@ test-exhaustive: $(STAMP) ## Run what `make test` and `make test-parts` leave ou
 	$(PYTEST) $(PARALLEL) -m exhaustive $(PYTEST_ARGS)
 
 test-fast: $(STAMP) ## Run the tests that are not marked slow, without parts and stability matrix (under 2 minutes)
-	$(PYTEST) -n $(WORKERS) --dist loadfile -m "not slow and not ($(PARTS))" --ignore=tests/stability
+	$(PYTEST) -n $(WORKERS) --dist loadfile -m "not slow and not exhaustive and not ($(PARTS))" --ignore=tests/stability
 
 pages: $(STAMP) ## Write the figures of the result files into README, docs and the cards of released models
 	$(BIN)/python -m benchmarks.page

@@ -67,6 +67,7 @@ def test_every_word_of_a_sweep_composes_and_fits_its_classes(sweep: str):
     assert len(different) == len(configs)  # no budget takes away what a sweep is about
 
 
+@pytest.mark.slow
 @pytest.mark.exhaustive  # each system and each data set is in a job of table2 above
 def test_every_system_fits_every_data_set_within_minutes():
     jobs = sweep_jobs(["sweep=table2", "budget=minutes"], None)

@@ -78,7 +78,8 @@ def test_there_is_no_ground_without_a_plane_without_normals_and_without_points()
     rays, beyond = looking(random(20, 3)), random(1, 20, 3)
     for seen in (clutter, bare, none):
         assert not ground_of(seen).found.any()
-        assert torch.equal(guess()(seen, rays, beyond), beyond)
+        colors, ground = guess()(seen, rays, beyond)
+        assert torch.equal(colors, beyond) and not ground.any()
 
 
 def test_members_of_a_batch_have_grounds_of_their_own():
@@ -93,6 +94,27 @@ def test_members_of_a_batch_have_grounds_of_their_own():
             torch.testing.assert_close(getattr(together, name)[member], found[0], rtol=0, atol=1e-12, msg=name)
 
 
+def test_what_the_mask_leaves_out_may_hold_anything():
+    seen = tilted_floor()
+    left_out = torch.arange(seen.mask.shape[1]) % 3 == 0
+    junk = {
+        name: torch.where(left_out.view(1, -1, *[1] * (value.dim() - 2)), torch.nan, value)
+        for name, value in vars(seen).items()
+        if name in ("positions", "normals", "views", "colors", "sizes")
+    }
+    masked = {**vars(seen), "mask": seen.mask & ~left_out}
+
+    for one, other in zip(ground_of(Scenery(**masked)), ground_of(Scenery(**masked | junk)), strict=True):
+        assert torch.equal(one, other) and torch.isfinite(one).all()
+
+
+def test_the_ground_is_sure_as_far_out_as_it_was_seen():
+    inside, outside = on_plane(random(20, 3) - 0.5), on_plane(UP + 3 + 4 * random(20, 3))
+    _, ground = guess()(tilted_floor(), looking(torch.cat([inside, outside])), random(1, 40, 3))
+
+    assert ground[0, :20].min() > 0.9 and not ground[0, 20:].any()
+
+
 def test_before_training_the_floor_goes_on_in_its_colour_and_ends_at_its_horizon():
     seen = tilted_floor()
     below = on_plane(40 * random(50, 3, seed=5) - 20)
@@ -102,7 +124,7 @@ def test_before_training_the_floor_goes_on_in_its_colour_and_ends_at_its_horizon
         rays = looking(targets)
         facing = (rays.directions @ UP)[0]
         beyond = torch.zeros(1, 50, 3, dtype=torch.float64)
-        colors = guess()(seen, rays, beyond)[0]
+        colors = guess()(seen, rays, beyond)[0][0]
         if is_floor:
             steep = facing < -0.06
             assert steep.sum() > 10
@@ -128,7 +150,7 @@ def test_what_one_camera_teaches_about_a_place_another_shows_and_a_direction_alo
     dark = torch.zeros(1, 400, 3, dtype=torch.float64)
 
     def drawn(model, rays):
-        return (model(seen, rays, dark) if model is by_place else model(rays.directions))[0]
+        return (model(seen, rays, dark)[0] if model is by_place else model(rays.directions))[0]
 
     errors = []
     for model in (by_place, by_direction):
@@ -151,7 +173,7 @@ def test_gradients_match_finite_differences():
 
     def draw(beyond, *values):
         given = dict(zip(weights, values, strict=True))
-        return torch.func.functional_call(model, given, (seen, rays, beyond))
+        return torch.func.functional_call(model, given, (seen, rays, beyond))[0]
 
     assert torch.autograd.gradcheck(draw, (random(1, 5, 3).requires_grad_(), *weights.values()))
 
@@ -166,7 +188,7 @@ def test_far_away_and_at_the_horizon_everything_is_finite():
         for sign in (-1, 0, 1):
             level = normalize(directions + sign * tilt, dim=-1)
             rays = Rays(CAMERA.expand_as(level)[None], level[None]).to(dtype)
-            colors = model(seen.to(dtype), rays, torch.zeros(1, 200, 3, dtype=dtype))
+            colors, _ = model(seen.to(dtype), rays, torch.zeros(1, 200, 3, dtype=dtype))
             colors.sum().backward()
             assert torch.isfinite(colors).all()
             assert all(torch.isfinite(weight.grad).all() for weight in model.parameters())

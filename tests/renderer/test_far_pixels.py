@@ -53,7 +53,6 @@ def layer(**changes):
         "backend": "torch",
         "elliptic": True,
         "far_pixels": True,
-        "far_goes_on": False,
     }
     return SceneryLayer(**settings | changes).double()
 
@@ -142,12 +141,13 @@ def test_a_renderer_draws_the_sky_behind_a_body_and_the_same_without_one():
     assert 1 <= hidden[: HORIZON * SIZE].sum() < 5 * SIZE
 
 
-def test_the_sky_goes_on_where_a_body_stood_before_it_but_not_into_the_floor():
+@pytest.mark.parametrize("rows", [(1, 5), (4, 13)])
+def test_sky_and_floor_go_on_where_a_body_stood_before_them_and_meet_at_the_horizon(rows):
     scenery, rays = outdoors()
     covered = torch.zeros(SIZE, SIZE, dtype=torch.bool)
-    covered[1:5, 6:10] = True  # by a body, when it was observed
+    covered[slice(*rows), 4:12] = True  # by a body, when it was observed
     covered = covered.flatten()
-    scenery = Scenery(**{**vars(scenery), "far_mask": scenery.far_mask & ~covered})
+    scenery = Scenery(**{**vars(scenery), "mask": scenery.mask & ~covered, "far_mask": scenery.far_mask & ~covered})
     empty = ball([0.0, 1.0, 1.2])
     empty = Particles(empty.positions, empty.features, mask=empty.mask & False, moving=empty.moving, scenery=scenery)
     torch.manual_seed(0)
@@ -156,11 +156,31 @@ def test_the_sky_goes_on_where_a_body_stood_before_it_but_not_into_the_floor():
 
     before, after = (model(empty, rays, None).rgbs[0] for model in (plain, going_on))
 
-    assert (before[covered] - tensor(SKY)).abs().max() > 0.1
-    assert (after[covered] - tensor(SKY)).abs().max() < 0.02
+    true = outdoors()[0].colors[0]
+    row = torch.arange(SIZE * SIZE) // SIZE
+    is_rim = (row == HORIZON - 1) | (row == HORIZON)
+    assert (before - true)[covered].abs().max() > 0.1
+    assert (after - true)[covered & ~is_rim].abs().max() < 0.02
+    assert (after - true)[covered & is_rim].abs().sum() < 0.1 * SIZE  # of three colours: no row is off
     torch.testing.assert_close(after[~covered], before[~covered], rtol=0, atol=0.02)
-    down = Rays(rays.origins, tensor([0.0, 0.6, -0.8]).expand_as(rays.directions))  # below the picture: unseen floor
-    assert (going_on(empty, down, None).rgbs - tensor(GRAY)).abs().max() < 0.02
+
+
+def test_the_sky_goes_on_beyond_the_end_of_a_floor():
+    """A floor that ends: farther out its plane still meets rays, but sky was seen there on both sides of the hole."""
+    scenery, rays = outdoors()
+    row = torch.arange(SIZE * SIZE) // SIZE
+    ended, hole = row < HORIZON + 2, (row == HORIZON) & (torch.arange(SIZE * SIZE) % SIZE == 8)
+    scenery = Scenery(
+        **{**vars(scenery), "mask": scenery.mask & ~ended, "far_mask": ended[None] & ~hole,
+           "colors": torch.where(ended[:, None], tensor(SKY), tensor(GRAY))[None],
+           "sizes": torch.where(ended, 1 / FOCAL, scenery.sizes)}
+    )  # fmt: skip
+    body = ball([0.0, 1.0, 1.2])
+    empty = Particles(body.positions, body.features, mask=body.mask & False, moving=body.moving, scenery=scenery)
+
+    seen = renderer(num_lights=0, unseen_ground=True)(empty, rays, None).rgbs[0]
+
+    assert (seen[hole] - tensor(SKY)).abs().max() < 0.1
 
 
 def test_the_width_of_a_pixel_learns_from_the_sky():

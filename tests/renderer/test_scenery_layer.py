@@ -18,7 +18,6 @@ def layer(num_candidates, **changes):
         "backend": "torch",
         "elliptic": True,
         "far_pixels": True,
-        "far_goes_on": False,
     }
     return SceneryLayer(**settings | changes).double()
 

@@ -51,10 +51,29 @@ def test_what_is_asked_for_now_counts(tmp_path: Path) -> None:
     assert added(words) == {"renderer.unseen_ground=true", "renderer.far_pixels=false"}
 
 
-def test_no_word_is_added_that_a_run_without_scenery_would_refuse(tmp_path: Path) -> None:
+def test_a_run_without_scenery_needs_none(tmp_path: Path) -> None:
     folder = run_of_an_older_version(tmp_path / "run", "scenery=false", without=LATER)
 
     assert added(resumed_overrides([f"resume={folder}"])) == {"scenery=false"}
+
+
+def test_a_section_that_is_given_counts_as_its_settings(tmp_path: Path) -> None:
+    folder = run_of_an_older_version(tmp_path / "run", without=LATER[:2])
+
+    words = resumed_overrides([f"resume={folder}", "renderer={far_pixels: true}"])
+
+    assert added(words) == {"renderer={far_pixels: true}"}
+
+
+@pytest.mark.parametrize("last", [2, 11])
+def test_what_it_was_last_resumed_with_counts(tmp_path: Path, last: int) -> None:
+    """Resumed by a version in between, a run has the settings of that."""
+    folder = run_of_an_older_version(tmp_path / "run", without=LATER[:2])
+    between = run_of_an_older_version(tmp_path / "between", without=LATER[:1])
+    (between / "config.yaml").rename(folder / f"config.resumed-{last}.yaml")
+    (folder / "config.resumed-1.yaml").write_text((folder / "config.yaml").read_text())
+
+    assert added(resumed_overrides([f"resume={folder}"])) == {"renderer.unseen_ground=false"}
 
 
 @pytest.mark.parametrize("is_readable", [True, False])

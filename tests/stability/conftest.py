@@ -45,10 +45,10 @@ def shapes_are_checked_once(request: pytest.FixtureRequest) -> Iterator[None]:
     """
     params = request.node.callspec.params if hasattr(request.node, "callspec") else {}
     route = (f"{name}={value!r}" for name, value in sorted(params.items()) if name not in ("scene", "mode"))
-    case = (str(request.node.path), request.node.originalname, *route)
+    case = (request.node.nodeid.partition("[")[0], *route)
     with unchecked_shapes() if case in _checked else nullcontext():
-        _checked.add(case)
         yield
+    _checked.add(case)
 
 
 @pytest.fixture(params=MODES, ids=lambda mode: mode.name)

@@ -30,13 +30,16 @@ _DARKEST = 0.01
 class Ground(NamedTuple):
     """The plane on which most of the scenery lies (floor, table top), and the mean colour seen on it.
 
-    It is ``normals @ x = heights`` (metres), with the normal on the side from which it was seen.
+    It is ``normals @ x = heights`` (metres), with the normal on the side from which it was seen. All that was seen of
+    it lies within ``radii`` (metres) of ``centers``.
     """
 
     normals: Float[Tensor, "batch 3"]
     heights: Float[Tensor, " batch"]
     colors: Float[Tensor, "batch 3"]
     found: Bool[Tensor, " batch"]
+    centers: Float[Tensor, "batch 3"]
+    radii: Float[Tensor, " batch"]
 
 
 @torch.no_grad()
@@ -47,28 +50,35 @@ def ground_of(scenery: Scenery) -> Ground:
     grazing angle counts as much as one seen from above.
     """
     some = slice(None, None, max(1, -(-scenery.positions.shape[1] // _MOST_POINTS)))
-    positions, normals, sizes = scenery.positions[:, some], scenery.normals[:, some], scenery.sizes[:, some]
-    known = scenery.mask[:, some] & (normals.square().sum(dim=-1) > 0.5)
-    grazing = (normals * scenery.views[:, some]).sum(dim=-1).abs().clamp(min=0.05)
-    areas = torch.where(known, sizes.square() / grazing, 0.0)
+    known = scenery.mask[:, some] & (scenery.normals[:, some].square().sum(dim=-1) > 0.5)
+    positions, normals, views, colors = (  # what is not known may hold anything
+        torch.where(known[..., None], values[:, some], 0.0)
+        for values in (scenery.positions, scenery.normals, scenery.views, scenery.colors)
+    )
+    sizes = torch.where(known, scenery.sizes[:, some], 0.0)
+    grazing = (normals * views).sum(dim=-1).abs().clamp(min=0.05)
+    areas = sizes.square() / grazing
     # Of the known points, as many as there are to try, evenly over their places in the cloud.
     count = known.sum(dim=1, keepdim=True)
     rank = torch.arange(_NUM_TRIED, device=positions.device) * count // _NUM_TRIED
-    tried = torch.searchsorted(known.cumsum(dim=1), rank + 1).clamp(max=known.shape[1] - 1)
-    axes = torch.take_along_dim(normals, tried[..., None], dim=1)
-    levels = (torch.take_along_dim(positions, tried[..., None], dim=1) * axes).sum(dim=-1, keepdim=True)
-    is_on = ((axes @ positions.mT - levels).abs() < sizes[:, None]) & (axes @ normals.mT > _ALIGNED)
+    tried = torch.searchsorted(known.cumsum(dim=1), rank + 1).clamp(max=known.shape[1] - 1)[..., None]
+    axes, places = (torch.take_along_dim(values, tried, dim=1)[:, :, None] for values in (normals, positions))
+    # Sums, not matrix products, which may be rounded by more than a pixel's width (float32_matmul_precision).
+    heights = ((positions[:, None] - places) * axes).sum(dim=-1)
+    is_on = (heights.abs() < sizes[:, None]) & ((normals[:, None] * axes).sum(dim=-1) > _ALIGNED)
     votes = (is_on * areas[:, None]).sum(dim=-1)
-    best = votes.argmax(dim=1, keepdim=True)
-    weights = torch.take_along_dim(is_on, best[..., None], dim=1).squeeze(1) * areas
+    best = votes.argmax(dim=1)[:, None, None]
+    is_on = torch.take_along_dim(is_on, best, dim=1).squeeze(1)
+    weights = is_on * areas
     share = weights.sum(dim=1) / areas.sum(dim=1).clamp(min=1e-30)
     weights = weights / weights.sum(dim=1, keepdim=True).clamp(min=1e-30)
 
     def mean(values: Tensor) -> Tensor:
-        return (weights[:, None] @ values).squeeze(1)
+        return (weights[..., None] * values).sum(dim=1)
 
-    normal = nn.functional.normalize(mean(normals), dim=-1)
-    return Ground(normal, (mean(positions) * normal).sum(dim=-1), mean(scenery.colors[:, some]), share > _LEAST_SHARE)
+    normal, center = nn.functional.normalize(mean(normals), dim=-1), mean(positions)
+    radii = torch.where(is_on, (positions - center[:, None]).square().sum(dim=-1), 0.0).amax(dim=1).sqrt()
+    return Ground(normal, (center * normal).sum(dim=-1), mean(colors), share > _LEAST_SHARE, center, radii)
 
 
 def _octaves(values: Tensor, count: int) -> Tensor:
@@ -106,18 +116,24 @@ class UnseenGround(nn.Module):
 
     def forward(
         self, scenery: Scenery, rays: Rays, beyond: Float[Tensor, "batch ray 3"]
-    ) -> Float[Tensor, "batch ray 3"]:
-        """Return colours in [0, 1]: ``beyond`` where a ray meets no ground."""
+    ) -> tuple[Float[Tensor, "batch ray 3"], Float[Tensor, "batch ray"]]:
+        """Return colours in [0, 1], ``beyond`` where a ray meets no ground; and how much of a ray surely meets it.
+
+        It does where it was seen farther out than the ray meets it; it may end there.
+        """
         ground = ground_of(scenery)
-        facing = (rays.directions @ ground.normals[..., None]).squeeze(-1)
-        above = (rays.origins @ ground.normals[..., None]).squeeze(-1) - ground.heights[:, None]
+        normals = ground.normals[:, None]
+        facing = (rays.directions * normals).sum(dim=-1)
+        above = (rays.origins * normals).sum(dim=-1) - ground.heights[:, None]
         distances = above / -facing.clamp(max=-1e-6)
         meets = ground.found[:, None] & (distances > self.near) & (facing < 0)
-        share = torch.where(meets, (-facing / _FADES).clamp(max=1), 0.0)[..., None]
-        places = (rays.origins + distances.clamp(min=0)[..., None] * rays.directions) / self.length
+        share = torch.where(meets, (-facing / _FADES).clamp(max=1), 0.0)
+        met = rays.origins + distances.clamp(min=0)[..., None] * rays.directions
+        is_within = (met - ground.centers[:, None]).square().sum(dim=-1) < ground.radii[:, None].square()
+        places = met / self.length
         radii = places.square().sum(dim=-1, keepdim=True).clamp(min=1e-20).sqrt()
         places = torch.where(radii > 1, (2 - 1 / radii) / radii, 1.0) * places
         inputs = torch.cat([_octaves(places, self.frequencies), _octaves(rays.directions, self.frequencies)], dim=-1)
         mean = torch.logit(ground.colors.clamp(_DARKEST, 1 - _DARKEST))[:, None]
         colors = torch.sigmoid(mean + self.network(inputs).to(mean.dtype))
-        return share * colors + (1 - share) * beyond
+        return share[..., None] * colors + (1 - share[..., None]) * beyond, share * is_within

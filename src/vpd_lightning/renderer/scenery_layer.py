@@ -56,22 +56,28 @@ class SceneryLayer(nn.Module):
     points, so a floor has its exact depth. Near is what the camera that saw a point sees near it: the footprint of a
     pixel is an ellipse on its plane (as in EWA splatting, Zwicker et al. 2001); where not ``elliptic`` it is a disc as
     wide as that ellipse is long. With ``far_pixels`` a ray also sees, behind the points, the pixels that measured no
-    distance, in whose direction it leads; with ``far_goes_on`` also between these, where a body stood before them.
+    distance, in whose direction it leads.
     """
 
-    def __init__(
-        self, *, num_candidates: int, near: float, backend: str, elliptic: bool, far_pixels: bool, far_goes_on: bool
-    ):
+    def __init__(self, *, num_candidates: int, near: float, backend: str, elliptic: bool, far_pixels: bool):
         super().__init__()
-        self.far_pixels, self.far_goes_on = far_pixels, far_goes_on
+        self.far_pixels = far_pixels
         self.num_candidates, self.near, self.backend, self.elliptic = num_candidates, near, backend, elliptic
         self.log_width = nn.Parameter(torch.tensor(math.log(0.5)))  # of a pixel
         self.log_angle = nn.Parameter(torch.tensor(math.log(0.2)))  # radians
 
     def forward(
-        self, scenery: Scenery, rays: Rays, background: Float[Tensor, "batch ray 3"] | None = None
+        self,
+        scenery: Scenery,
+        rays: Rays,
+        background: Float[Tensor, "batch ray 3"] | None = None,
+        ground: Float[Tensor, "batch ray"] | None = None,
     ) -> SeenScenery:
-        """Look along the rays (``batch ray 3``, the scenery's batch axis), before a background: black if not given."""
+        """Look along the rays (``batch ray 3``, the scenery's batch axis), before a background: black if not given.
+
+        Where ``ground``, the share of the background that is ground, is given, far pixels go on where there is none:
+        a body stood before them.
+        """
         index = self._candidates(scenery, rays)
         batch = torch.arange(len(index), device=index.device)[:, None, None]
         flat = (batch * scenery.positions.shape[1] + index.clamp(min=0)).flatten()
@@ -120,8 +126,8 @@ class SceneryLayer(nn.Module):
             return SeenScenery(colors, distances, opacities, background)
         far = seen_far(scenery, rays, self.log_width.exp(), self.backend)
         beyond = far.opacities[..., None]
-        if self.far_goes_on:
-            beyond = beyond + (1 - beyond) * far.going_on(nearest)[..., None]
+        if ground is not None:
+            beyond = beyond + (1 - beyond) * ((1 - ground) * far.going_on(nearest))[..., None]
         behind = beyond * far.colors + (1 - beyond) * background
         return SeenScenery(colors, distances, opacities * far.leaves(nearest), behind)
 

@@ -141,7 +141,6 @@ class SplatRenderer(AbstractRenderer):
                 backend=candidate_backend,
                 elliptic=elliptic_footprints,
                 far_pixels=far_pixels,
-                far_goes_on=unseen_ground,
             )
             if num_lights:
                 self.shadows = Shadows(num_lights=num_lights, softness=surface_scale * shadow_softness)
@@ -289,10 +288,10 @@ class SplatRenderer(AbstractRenderer):
             kept, found = self._kept
             if all(one is other for one, other in zip(held, kept[0], strict=True)) and key[1:] == kept[1:]:
                 return found
-        background = self.background(clip_rays.directions)
+        background, ground = self.background(clip_rays.directions), None
         if self.unseen_ground is not None:
-            background = self.unseen_ground(scenery, clip_rays, background)
-        seen = self.scenery(scenery, clip_rays, background)
+            background, ground = self.unseen_ground(scenery, clip_rays, background)
+        seen = self.scenery(scenery, clip_rays, background, ground)
         points = clip_rays.origins + seen.distances[..., None] * clip_rays.directions
         first = torch.ones_like(points)
         if self.shadows is not None:

@@ -64,7 +64,12 @@ def provide_data(
 
 
 def _provide_one(whole: Path, settings: dict[str, Any], split: str, number: int) -> Path:
-    """Generate a split as far as one trajectory, in a folder called after both, unless it is there."""
+    """Generate a split as far as one trajectory, in a folder called after both; one that goes as far is taken.
+
+    Raises:
+        ConfigError: the whole data set would not have that trajectory.
+        DataError: a folder of that name holds recordings of other settings.
+    """
     from data_gen.generate import generate, make_plan
 
     counts = asdict(make_plan(out=whole, overrides={}, **settings).settings.splits)
@@ -73,13 +78,15 @@ def _provide_one(whole: Path, settings: dict[str, Any], split: str, number: int)
         raise ConfigError(
             f"There is no trajectory {number} in split {split}.\nThe data set has, counted from 0: {has}."
         )
-    folder = whole.with_name(f"{whole.name}_{split}_{number + 1}")
+    name = f"{whole.name}_{split}_"
+    there = [path.parent.name.removeprefix(name) for path in whole.parent.glob(f"{name}*/{FILE_NAME}")]
+    count = min((int(end) for end in there if end.isdecimal() and int(end) > number), default=number + 1)
+    folder = whole.with_name(f"{name}{count}")
+    sizes = {f"splits.{other}": count * (other == split) for other in counts}
     if not (folder / FILE_NAME).is_file():
-        sizes = {f"splits.{name}": (number + 1) * (name == split) for name in counts}
-        words = " ".join(f"{name}={value}" for name, value in (settings | sizes | {"out": folder}).items())
+        words = " ".join(f"{key}={value}" for key, value in (settings | sizes | {"out": folder}).items())
         print(f"there is no data set in {whole}; making what is shown of it: vpd-data generate {words}", flush=True)
-        generate(**settings, out=folder, overrides=sizes)
-    return folder
+    return generate(**settings, out=folder, overrides=sizes)  # where it is there, whether it has these settings
 
 
 def require_trusted_data(config: Mapping[str, Any]) -> None:

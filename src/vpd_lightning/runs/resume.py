@@ -12,7 +12,7 @@ from vpd_lightning.errors import CheckpointError, ConfigError
 from vpd_lightning.moved import current_name
 
 OVERRIDES_FILE = "overrides.yaml"
-CONFIG_FILE = "config.yaml"
+CONFIG_FILES = "config*.yaml"  # config.resumed-N.yaml of a run that was resumed
 
 
 def resumed_overrides(overrides: Sequence[str], config_dir: str | Path | None = None) -> list[str]:
@@ -51,7 +51,7 @@ def resumed_overrides(overrides: Sequence[str], config_dir: str | Path | None = 
     merged = _as_mapping([*_saved_overrides(folder), *overrides])
     merged["resume"] = merged["run.folder"] = quote(str(folder.absolute()))
     words = [f"{key}={value}" for key, value in merged.items()]
-    later = {key: value for key, value in _later_settings(_saved_config(folder)) if key not in merged}
+    later = {key: value for key, value in _later_settings(_saved_config(folder)) if not _is_given(key, merged)}
     if later:  # composing takes half a second
         from vpd_lightning.config import compose
 
@@ -68,6 +68,13 @@ def _later_settings(config: Mapping[str, Any], where: str = "") -> Iterator[tupl
             for key, value in ADDED_SETTINGS.get(current_name(str(section.get("_target_"))), {}).items():
                 if key not in section:
                     yield f"{where}{name}.{key}", value
+
+
+def _is_given(key: str, words: Mapping[str, str]) -> bool:
+    """Whether words set a key, or a section that it is in: ``renderer={far_pixels: true}``."""
+    parts = key.split(".")
+    sections = (".".join(parts[:count]) for count in range(1, len(parts)))
+    return key in words or any(words.get(section, "").startswith("{") for section in sections)
 
 
 def _value(config: Any, key: str, default: Any) -> Any:
@@ -147,10 +154,11 @@ def _saved_overrides(folder: Path) -> list[str]:
 
 
 def _saved_config(folder: Path) -> Mapping[str, Any]:
-    """Return the configuration with which the run began; empty where there is none to read."""
+    """Return the configuration with which the run was started or resumed last; empty where there is none to read."""
     try:
-        config = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError):
+        youngest = max(folder.glob(CONFIG_FILES), key=lambda path: int(path.stem.partition("resumed-")[2] or 0))
+        config = yaml.safe_load(youngest.read_text(encoding="utf-8"))
+    except (ValueError, OSError, yaml.YAMLError):  # ValueError: there is none, it is no text, or has another name
         return {}
     return config if isinstance(config, Mapping) else {}
 
