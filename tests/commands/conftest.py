@@ -1,24 +1,16 @@
 """A tiny data set and a short training of it, made once for all tests of commands."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from data_gen.generate import generate
 from tests.shared_folder import made_once
-from tests.unchecked_shapes import unchecked_shapes
 from vpd_lightning.commands import train
 
 SMALL = {"num_frames": 10, "camera.num_views": 3, "camera.height": 32, "camera.width": 32}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def shapes_are_left_unchecked() -> Iterator[None]:
-    """What a command computes has tests of its own, which check shapes; here they would take a quarter of the time."""
-    with unchecked_shapes():
-        yield
 
 
 @pytest.fixture(scope="session")

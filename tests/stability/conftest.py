@@ -1,8 +1,6 @@
 """The axes of the stability matrix, and which of its cases `make test` leaves to `make stability`."""
 
 from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -10,7 +8,6 @@ import torch
 
 from tests.stability.covering import covering
 from tests.stability.hard_scenes import MODES, SCENES, HardScene, Mode
-from tests.unchecked_shapes import unchecked_shapes
 
 FOLDER = Path(__file__).parent
 
@@ -32,23 +29,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for place, case in enumerate(cases):
             if place not in chosen:
                 case.add_marker(pytest.mark.exhaustive)
-
-
-_checked: set[tuple[str, ...]] = set()
-
-
-@pytest.fixture(autouse=True)
-def shapes_are_checked_once(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Check shapes in the first case of each test and route: others differ in values, and checks take a third of them.
-
-    ``tests/`` checks the shapes of everything that the matrix calls.
-    """
-    params = request.node.callspec.params if hasattr(request.node, "callspec") else {}
-    route = (f"{name}={value!r}" for name, value in sorted(params.items()) if name not in ("scene", "mode"))
-    case = (request.node.nodeid.partition("[")[0], *route)
-    with unchecked_shapes() if case in _checked else nullcontext():
-        yield
-    _checked.add(case)
 
 
 @pytest.fixture(params=MODES, ids=lambda mode: mode.name)
