@@ -120,7 +120,7 @@ test-benchmarks: $(STAMP) ## Test that every benchmark suite runs and writes its
 test-reliability: $(STAMP) ## Test what make reliability tests, in small
 	$(PYTEST) tests/reliability -m reliability
 
-test-exhaustive: $(STAMP) ## Run what `make test` and `make test-parts` leave out (an hour): every case of the matrix, more seeds and scenes
+test-exhaustive: $(STAMP) ## Run what `make test` and `make test-parts` leave out: every case of the matrix, more seeds and scenes
 	$(PYTEST) $(PARALLEL) -m exhaustive $(PYTEST_ARGS)
 
 test-fast: $(STAMP) ## Run the tests that are not marked slow, without parts and stability matrix (under 2 minutes)

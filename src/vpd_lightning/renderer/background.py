@@ -23,7 +23,7 @@ _LEAST_SHARE = 0.3
 _FADES = 0.05
 """Cosine below which the ground fades into the direction's colour: at its horizon a pixel covers all of it."""
 
-_DARKEST = 0.01
+DARKEST = 0.01
 """Colours nearer to 0 or 1 have no logit to add to."""
 
 
@@ -134,6 +134,6 @@ class UnseenGround(nn.Module):
         radii = places.square().sum(dim=-1, keepdim=True).clamp(min=1e-20).sqrt()
         places = torch.where(radii > 1, (2 - 1 / radii) / radii, 1.0) * places
         inputs = torch.cat([_octaves(places, self.frequencies), _octaves(rays.directions, self.frequencies)], dim=-1)
-        mean = torch.logit(ground.colors.clamp(_DARKEST, 1 - _DARKEST))[:, None]
+        mean = torch.logit(ground.colors.clamp(DARKEST, 1 - DARKEST))[:, None]
         colors = torch.sigmoid(mean + self.network(inputs).to(mean.dtype))
         return share[..., None] * colors + (1 - share[..., None]) * beyond, share * is_within

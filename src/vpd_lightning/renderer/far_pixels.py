@@ -25,7 +25,6 @@ _RIM = 0.85
 ends between its last row of pixels and the first row of sky (1 apart); within a surface no ray is more than 0.71 from
 a point."""
 
-
 _GOES_ON = 16.0
 """Pixel widths over which a sky fades beyond its last pixel: what stands before it covers as much."""
 

@@ -11,16 +11,13 @@ from torch import Tensor, nn
 from vpd_lightning.geometry.decay import decay
 from vpd_lightning.geometry.occluders import MOST_OCCLUDERS, occluders_of, thinned
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.renderer.background import Background, UnseenGround
+from vpd_lightning.renderer.background import DARKEST, Background, UnseenGround
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.renderer.scenery_layer import SceneryLayer, SeenScenery
 from vpd_lightning.renderer.shadows import Shadows
 from vpd_lightning.types import Occluders, Particles, Rays, RenderedRays, Scenery, require_finite
-
-_DARKEST = 0.01
-"""Colours nearer to 0 or 1 have no logit to add to."""
 
 _GROUND_LENGTH = 20.0
 """Surface scales within which a place on the ground is told from others; beyond, less and less."""
@@ -244,7 +241,7 @@ class SplatRenderer(AbstractRenderer):
         logits = outputs[..., :6].unflatten(-1, (2, 3))
         if self.color_features:
             means = inputs.unflatten(-1, (2, -1))[..., :3].to(logits.dtype)
-            logits = logits + torch.logit(means.clamp(_DARKEST, 1 - _DARKEST))
+            logits = logits + torch.logit(means.clamp(DARKEST, 1 - DARKEST))
         before_training = self._coverage(inputs) if has_scenery else 1.0
         return _Layers(torch.sigmoid(logits), torch.sigmoid(outputs[..., 6:] + before_training) * sees_any, depth)
 
