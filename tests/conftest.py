@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests import cpu_seconds, fork_server
+from tests import cpu_seconds, fork_server, shape_checks
 from tests.cpu_seconds import pytest_addoption  # noqa: F401
+
+shape_checks.install()  # before a module of ours is imported
 
 # Tests run in several processes; more threads than cores makes all of them slower. Set before OpenCV or HDF5 load.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -73,6 +75,7 @@ def _requirements(request: pytest.FixtureRequest) -> None:
 
 @pytest.fixture(autouse=True)
 def _seed() -> None:
+    shape_checks.start_again()
     random.seed(0)
     np.random.seed(0)
     torch.manual_seed(0)

@@ -6,7 +6,7 @@ same in all scenes can come near it.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.unchecked_shapes import unchecked_shapes
 from vpd_lightning.dynamics.hierarchical_gnn import HierarchicalGNNDynamics
 from vpd_lightning.encoder.base import EncoderOutput
 from vpd_lightning.encoder.unet import UNetEncoder
@@ -69,15 +68,14 @@ def train(simulator: Simulator, lr: float, num_updates: int, still: bool) -> Non
         lr=lr, betas=[0.9, 0.999], eps=1e-8, stage_multipliers={}, warmup_steps=50, final_share=0.0
     ).build(simulator, num_updates)
     for step in range(num_updates):
-        with unchecked_shapes() if step else nullcontext():  # they are those of the first update
-            flights = SCENE.flights(int(still), step, BATCH, 1, RAYS, still=still)
-            previous, current = encoded(simulator, flights)
-            states = [current] if still else simulator.unroll(previous, current, 1, flights.batch.keys)
-            rendered = simulator._render_steps([simulator._shown(state) for state in states], flights.batch.rays, None)
-            optimizer.zero_grad()
-            (rendered.rgbs - flights.batch.rgbs).square().mean().backward()
-            torch.nn.utils.clip_grad_norm_(simulator.parameters(), 1.0)
-            optimizer.step()
+        flights = SCENE.flights(int(still), step, BATCH, 1, RAYS, still=still)
+        previous, current = encoded(simulator, flights)
+        states = [current] if still else simulator.unroll(previous, current, 1, flights.batch.keys)
+        rendered = simulator._render_steps([simulator._shown(state) for state in states], flights.batch.rays, None)
+        optimizer.zero_grad()
+        (rendered.rgbs - flights.batch.rgbs).square().mean().backward()
+        torch.nn.utils.clip_grad_norm_(simulator.parameters(), 1.0)
+        optimizer.step()
         schedule.step()
 
 

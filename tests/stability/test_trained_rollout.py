@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from tests.stability.hard_scenes import MODES, Mode
-from tests.unchecked_shapes import unchecked_shapes
 from vpd_lightning.data.clip import read_clip
 from vpd_lightning.evaluation.motion import trajectory_of
 from vpd_lightning.evaluation.prediction import encode_clip
@@ -33,7 +32,7 @@ def test_five_hundred_steps_stay_finite_and_do_not_speed_up(recording: Path, mod
     model = load_model(RELEASED)
     simulator = model.simulator.to(mode.dtype)
     clip = read_clip(recording, 0, 0, 1)
-    with torch.no_grad(), mode.context(torch.device("cpu")), unchecked_shapes():
+    with torch.no_grad(), mode.context(torch.device("cpu")):
         scene = encode_clip(simulator, clip, model.input_views)
         positions = trajectory_of(scene.current, simulator.rollout(scene, NUM_STEPS))
     assert positions.shape[0] == NUM_STEPS + 1
