@@ -1,7 +1,7 @@
 """The method on one screen: encode two frames, roll out, render. No Lightning, no Hydra."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from vpd_lightning.system import AbstractSystem
 from vpd_lightning.types import (
     NUM_CONTEXT_FRAMES,
     Cameras,
+    HiddenSide,
     Occluders,
     Particles,
     Rays,
@@ -159,6 +160,10 @@ class Simulator(AbstractSystem):
         def flatten(tensors: Sequence[Tensor]) -> Tensor:
             return torch.stack(list(tensors), dim=1).flatten(0, 1)
 
+        hidden = None
+        if states[0].hidden_side is not None:
+            names = [item.name for item in fields(HiddenSide)]
+            hidden = {name: flatten([getattr(s.hidden_side, name) for s in states]) for name in names}
         particles = Particles(
             positions=flatten([s.positions for s in states]),
             features=flatten([s.features for s in states]),
@@ -167,6 +172,7 @@ class Simulator(AbstractSystem):
             normals=None if states[0].normals is None else flatten([s.normals for s in states]),  # type: ignore[misc]
             scenery=states[0].scenery,
             occluders=occluders,
+            hidden_side=None if hidden is None else HiddenSide(**hidden),
         )
         flat_rays = Rays(rays.origins.flatten(0, 1), rays.directions.flatten(0, 1))
         if keys is not None:  # one set of draws per (member, step); steps stay apart for up to a million steps
@@ -198,7 +204,8 @@ class Simulator(AbstractSystem):
         """Encode two frames: ``rgb`` (2, view, height, width, 3) uint8 or [0, 1], ``depth`` in metres.
 
         ``cameras`` has axes ``view`` or ``2 view``. The draws (particle subsample) are the same every time, unless
-        ``keys`` (for a batch of one) says otherwise.
+        ``keys`` (for a batch of one) says otherwise. The current particles come with what the dynamics guesses of their
+        hidden side.
         """
         self.eval()
         if rgb.shape[:1] != (2,) or rgb.shape[:-1] != depth.shape:
@@ -216,7 +223,8 @@ class Simulator(AbstractSystem):
             here = cameras[time] if len(cameras.shape) == 2 else cameras
             frames = RGBDFrames(rgb[time][None], depth[time][None], here[None])
             states.append(self.encoder(frames, keys, purpose).particles)
-        return Scene(*states)
+        previous, current = states
+        return Scene(previous, self.dynamics.completed(previous, current, keys))
 
     @torch.no_grad()
     def rollout(self, scene: Scene, num_steps: int, keys: RandomKeys | None = None) -> list[Particles]:

@@ -14,6 +14,9 @@ from vpd_lightning.randomness import RandomKeys
 NUM_CONTEXT_FRAMES = 2
 """Observed frames that a model of particles starts from: two give each particle a position and a velocity."""
 
+OTHER_AXES = ("scenery", "occluders", "hidden_side")
+"""Fields of particles that have an axis of their own in place of that of the particles."""
+
 Border = TypeVar("Border", bound="_Border")
 
 
@@ -116,6 +119,16 @@ class Occluders(_Border):
 
 
 @dataclass(frozen=True)
+class HiddenSide(_Border):
+    """Particles of moving bodies that no camera saw: guesses of a dynamics, for the renderer alone."""
+
+    positions: Float[Tensor, "*batch hidden 3"]
+    features: Float[Tensor, "*batch hidden feature"]
+    normals: Float[Tensor, "*batch hidden 3"]
+    mask: Bool[Tensor, "*batch hidden"]
+
+
+@dataclass(frozen=True)
 class Particles(_Border):
     """Latent particles, dense and padded; ``mask`` is false for padding. The batch axis may be absent.
 
@@ -123,6 +136,7 @@ class Particles(_Border):
     where unknown) are observations carried along for a dynamics that uses them; the paper's does not. With ``scenery``
     particles that are not ``moving`` are for the dynamics alone: a renderer draws the scenery in their place.
     ``occluders`` cast the shadows in place of moving particles: in training, what was seen to move at that time.
+    ``hidden_side`` is what a dynamics guesses of them beyond what was seen.
     """
 
     positions: Float[Tensor, "*batch particle 3"]
@@ -133,6 +147,7 @@ class Particles(_Border):
     normals: Float[Tensor, "*batch particle 3"] | None = None
     scenery: Scenery | None = None
     occluders: Occluders | None = None
+    hidden_side: HiddenSide | None = None
 
     def __post_init__(self) -> None:
         if self.mask is None:
@@ -144,10 +159,22 @@ class Particles(_Border):
         return self.positions.shape[-2]
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> "Particles":
-        """Apply a function to every tensor with a particle axis; the scenery and occluders stay."""
-        names = [item.name for item in fields(self) if item.name not in ("scenery", "occluders")]
+        """Apply a function to every tensor with a particle axis; scenery, occluders and hidden side stay."""
+        names = [item.name for item in fields(self) if item.name not in OTHER_AXES]
         known = {name: value for name in names if (value := getattr(self, name)) is not None}
         return replace(self, **{name: function(value) for name, value in known.items()})
+
+    def with_hidden_side(self) -> "Particles":
+        """Return what is drawn of the particles and of what is guessed beside them, as one set."""
+        hidden, normals = self.hidden_side, self.normals
+        if hidden is None:
+            return self
+        return Particles(
+            positions=torch.cat([self.positions, hidden.positions], dim=-2),
+            features=torch.cat([self.features, hidden.features], dim=-2),
+            mask=torch.cat([self.mask, hidden.mask], dim=-1),
+            normals=None if normals is None else torch.cat([normals, hidden.normals], dim=-2),
+        )
 
     def without_padding(self) -> "Particles":
         """Return the same particles with zeros in padding: NaN there would survive a product with zero."""

@@ -35,6 +35,8 @@ SETTINGS = {
     "keep_shape": True,
     "carry_memory": True,
     "shadow_scales": [0.1, 0.4],
+    "extent_weight": 0.0,
+    "guess_hidden": False,
 }
 FIRST_VELOCITY = {
     "match_scales": [0.8, 0.5, 0.3, 0.18, 0.12, 0.08],

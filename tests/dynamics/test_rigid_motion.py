@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from tests.dynamics.solids import cube, rotation_about
+from tests.dynamics.solids import cube, even_cube, rotation_about
 from vpd_lightning.dynamics.inertial.rigid_motion import (
     equidistant_centers,
     fit_twists,
@@ -46,13 +46,34 @@ def test_centre_of_a_cube_is_found_from_the_faces_that_are_seen():
     assert (centers[0, 0] - shift).norm() < 0.2 * mean_error
 
 
-def test_one_seen_face_leaves_the_centre_with_the_particles():
+@pytest.mark.parametrize("faces", [[0, 2], [0, 2, 4], [1, 2, 5]])
+def test_extents_find_the_centre_of_a_cube_of_which_a_corner_is_seen(faces):
+    """Tangent planes alone leave it anywhere on the diagonal through the corner."""
+    positions, normals = even_cube(10)
+    some = torch.cat([torch.arange(100 * face, 100 * face + 100) for face in faces])
+    rotation, shift = rotation_about([1, 1, 0], 0.8), torch.tensor([0.3, -0.2, 0.6], dtype=torch.float64)
+    seen, directions = (positions[some] @ rotation.T + shift)[None], (normals[some] @ rotation.T)[None]
+    strays = torch.tensor([[[9.0, 9.0, 9.0]] * 2], dtype=torch.float64)  # of another anchor, and far away
+    seen, directions = torch.cat([seen, strays], dim=1), torch.cat([directions, torch.zeros_like(strays)], dim=1)
+    weights = torch.zeros(1, 2, len(some) + 2, dtype=torch.float64)
+    weights[0, 0, : len(some)], weights[0, 1, len(some) :] = 1 / len(some), 1 / 2
+
+    by_planes = equidistant_centers(seen, directions, weights)[0, 0]
+    centers = equidistant_centers(seen, directions, weights, extent_weight=0.1)[0]
+
+    assert (by_planes - shift).norm() > 0.07
+    assert (centers[0] - shift).norm() < 0.02
+    assert torch.allclose(centers[1], strays[0, 0])
+
+
+@pytest.mark.parametrize("extent_weight", [0.0, 0.1])
+def test_one_seen_face_leaves_the_centre_with_the_particles(extent_weight):
     positions = torch.rand(100, 3, dtype=torch.float64)
     positions[:, 2] = 0
     normals = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(100, 3)
     weights = torch.full((1, 1, 100), 0.01, dtype=torch.float64)
 
-    centers = equidistant_centers(positions[None], normals[None], weights)
+    centers = equidistant_centers(positions[None], normals[None], weights, extent_weight)
 
     assert torch.allclose(centers[0, 0], positions.mean(0), atol=1e-6)
 

@@ -12,7 +12,7 @@ from vpd_lightning.editing.rotation import about_axis
 from vpd_lightning.editing.selectors import Box
 from vpd_lightning.errors import EditError
 from vpd_lightning.simulator import Scene
-from vpd_lightning.types import Particles, Scenery
+from vpd_lightning.types import OTHER_AXES, Particles, Scenery
 
 CORNER = Box([-2, -2, -0.1], [-0.5, -0.5, 0.1])
 """A piece of the floor."""
@@ -240,7 +240,7 @@ def test_a_stored_scene_keeps_its_scenery(tmp_path):
 
     assert equal(loaded.current.scenery, scene.current.scenery) and loaded.previous.scenery is None
     for item in fields(Particles):
-        if item.name not in ("scenery", "occluders"):
+        if item.name not in OTHER_AXES:
             assert torch.equal(getattr(loaded.current, item.name), getattr(scene.current, item.name))
     none_casts = replace(scene.current.scenery, occluders=torch.zeros(1, 0, 3), occluder_mask=torch.zeros(1, 0).bool())
     save_scene(tmp_path / "none.npz", Scene(scene.previous, replace(scene.current, scenery=none_casts)))

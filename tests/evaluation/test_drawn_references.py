@@ -21,7 +21,7 @@ from vpd_lightning.evaluation.report import metrics_of, step_table, write_metric
 from vpd_lightning.evaluation.summary import summary_lines
 from vpd_lightning.metrics.registry import DRAWN
 from vpd_lightning.metrics.rigid_motion import inside_box
-from vpd_lightning.types import Cameras, Particles
+from vpd_lightning.types import Cameras, HiddenSide, Particles
 
 NUM_STEPS = 4
 
@@ -40,7 +40,11 @@ def _drawn(paths: list[Path]) -> tuple[Recorder, Clip, Particles, list[list[Part
     scene = oracle.encode(clip.rgb[:, [0]], clip.depth[:, [0]], clip.cameras[:, [0]])
     upwards = torch.zeros_like(scene.current.positions)
     upwards[..., 2] = 1
-    current = replace(scene.current, normals=upwards)
+    body = inside_box(scene.current.positions[0], clip.poses(0)[0, 0], torch.from_numpy(HALF_SIZE[0]), 0.02)
+    # What is guessed here is the body once more, so that it must stay where the body is.
+    parts = (part[:, body] for part in (scene.current.positions, scene.current.features, upwards))
+    side = HiddenSide(*parts, mask=torch.ones(1, int(body.sum()), dtype=torch.bool))
+    current = replace(scene.current, normals=upwards, hidden_side=side)
     images = drawn_references(oracle, replace(scene, current=current), clip, 0.02)
     assert list(images) == list(DRAWN) and all(image.shape[-1] == 3 for image in images.values())
     return oracle, clip, current, oracle.seen
@@ -53,6 +57,18 @@ def test_nothing_moves_is_drawn_once_and_the_true_motion_is_the_oracles(test_pat
     for state, expected in zip(true, oracle.rollout(scene, NUM_STEPS), strict=True):
         torch.testing.assert_close(state.positions, expected.positions, atol=1e-9, rtol=0)
         assert torch.equal(state.features, expected.features), "the dynamics may shade what it turns"
+
+
+def test_the_hidden_side_goes_with_its_body(test_paths: list[Path]) -> None:
+    _, clip, current, drawn = _drawn(test_paths)
+    body = inside_box(current.positions[0], clip.poses(0)[0, 0], torch.from_numpy(HALF_SIZE[0]), 0.02)
+    assert body.any() and not body.all()
+    for state in [state for states in drawn for state in states]:
+        side = state.hidden_side
+        assert side is not None and state.normals is not None
+        torch.testing.assert_close(side.positions, state.positions[:, body], atol=1e-9, rtol=0)
+        torch.testing.assert_close(side.normals, state.normals[:, body], atol=1e-9, rtol=0)
+    assert not torch.allclose(drawn[-1][-1].positions[:, body], current.positions[:, body], atol=0.01)
 
 
 def test_the_kept_velocity_goes_on_straight_and_turns_on(test_paths: list[Path]) -> None:

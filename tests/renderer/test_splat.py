@@ -1,3 +1,4 @@
+from dataclasses import replace
 from importlib.util import find_spec
 
 import pytest
@@ -10,7 +11,7 @@ from vpd_lightning.config import build
 from vpd_lightning.config.migrations import upgraded
 from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.renderer.splat import SplatRenderer
-from vpd_lightning.types import Particles, Rays
+from vpd_lightning.types import HiddenSide, Particles, Rays
 
 SETTINGS = {
     "feature_dim": 5,
@@ -339,3 +340,20 @@ def test_a_particle_that_is_not_finite_is_refused_by_name():
 def test_wrong_settings_are_refused(changes):
     with pytest.raises(ValueError):
         renderer(**changes)
+
+
+def test_the_hidden_side_is_drawn_with_the_particles():
+    """As if what is guessed were particles: in front of a camera behind the body, at the end of every member's own."""
+    model, generator = renderer(facing_softness=0.1), torch.Generator().manual_seed(5)
+    perturb(model)
+    plain, lines = particles(count=60), rays()
+    normals = torch.nn.functional.normalize(torch.randn(2, 60, 3, generator=generator, dtype=torch.float64), dim=-1)
+    whole = replace(plain, normals=normals, mask=torch.rand(2, 60, generator=generator) < 0.8)
+    parts = {name: getattr(whole, name)[:, 40:] for name in ("positions", "features", "normals", "mask")}
+    seen = whole.mapped(lambda values: values[:, :40])
+
+    drawn = model(replace(seen, hidden_side=HiddenSide(**parts)), lines, None)
+
+    expected = model(whole, lines, None)
+    assert torch.equal(drawn.rgbs, expected.rgbs) and torch.equal(drawn.depths, expected.depths)
+    assert not torch.allclose(drawn.rgbs, model(seen, lines, None).rgbs, atol=1e-3)

@@ -31,6 +31,7 @@ _ONLY_WITH: dict[str, tuple[str, Callable[[Any], bool], str]] = {
     "renderer.elliptic_footprints": ("renderer.has_scenery", bool, "true"),
     "renderer.far_pixels": ("renderer.has_scenery", bool, "true"),
     "renderer.unseen_ground": ("renderer.has_scenery", bool, "true"),
+    "dynamics.guess_hidden": ("dynamics.keep_shape", bool, "true"),
     "renderer.num_scenery_candidates": ("renderer.has_scenery", bool, "true"),
     "light_fit.num_pairs": ("renderer.num_lights", bool, "more than 0"),
     "light_fit.num_updates": ("renderer.num_lights", bool, "more than 0"),

@@ -33,7 +33,12 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "aggregation": "sum",
         "update_features": True,
     },
-    f"{_DYNAMICS}inertial.InertialDynamics": {"keep_shape": True, "carry_memory": True},
+    f"{_DYNAMICS}inertial.InertialDynamics": {
+        "keep_shape": True,
+        "carry_memory": True,
+        "extent_weight": 0.0,
+        "guess_hidden": False,
+    },
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},
     "vpd_lightning.simulator.Simulator": {"pixel_gradient_to_motion": 1.0},
     # kernel_scales and layer_depth were in metres.

@@ -20,6 +20,10 @@ class AbstractDynamics(nn.Module, ABC):
         """Build the memory from the two observed frames; the paper's dynamics needs none."""
         return None
 
+    def completed(self, previous: Particles, current: Particles, keys: RandomKeys) -> Particles:
+        """Return the current particles with what the dynamics guesses beside them to be drawn; here nothing."""
+        return current
+
     @abstractmethod
     def forward(
         self, previous: Particles, current: Particles, memory: Any, keys: RandomKeys, rollout_step: int

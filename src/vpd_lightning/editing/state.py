@@ -13,7 +13,7 @@ from vpd_lightning.editing.matching import match_frames
 from vpd_lightning.editing.scenery import joined_scenery, only_scenery, transformed_scenery
 from vpd_lightning.errors import EditError
 from vpd_lightning.simulator import Scene
-from vpd_lightning.types import Particles
+from vpd_lightning.types import OTHER_AXES, Particles
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,8 @@ def start_state(
     for frame, given in ((scene.previous, previous_colors), (scene.current, colors)):
         if given is not None and given.shape != frame.positions.shape[1:]:
             raise EditError(f"Colours have shape {tuple(given.shape)}, positions {tuple(frame.positions.shape[1:])}.")
+    # What is guessed beside the particles would not follow the edits; the rollout guesses it anew.
+    scene = Scene(*(replace(frame, hidden_side=None) for frame in (scene.previous, scene.current)))
     clusters = object_clusters(scene.current)
     origin = match_frames(scene.previous, scene.current, clusters, previous_colors, colors)
     return EditState(scene, origin, colors)
@@ -71,7 +73,7 @@ def start_state(
 def chosen_slots(particles: Particles, chosen: Bool[Tensor, " particle"]) -> Particles:
     """Return only the chosen slots of a frame (batch axis of 1)."""
     kept = particles.mapped(lambda values: values[:, chosen])
-    return replace(kept, scenery=only_scenery(particles, chosen))
+    return replace(kept, scenery=only_scenery(particles, chosen), hidden_side=None)
 
 
 def joined(first: Particles, second: Particles) -> Particles:
@@ -90,7 +92,7 @@ def joined(first: Particles, second: Particles) -> Particles:
         raise EditError("Only one of the two scenes has scenery.\nEncode both with the same model.")
     parts: dict[str, Any] = {"scenery": joined_scenery(first.scenery, second.scenery)}
     for item in fields(first):
-        if item.name == "scenery":
+        if item.name in OTHER_AXES:
             continue
         one, other = getattr(first, item.name), getattr(second, item.name)
         if (one is None) != (other is None):

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vpd_lightning.data.clip import Clip
@@ -14,7 +14,7 @@ from vpd_lightning.evaluation.prediction import PredictsVideo, render_steps, sta
 from vpd_lightning.metrics.body_dynamics import best_rotation
 from vpd_lightning.metrics.registry import NOTHING_MOVES, TRUE_MOTION, TRUE_VELOCITY
 from vpd_lightning.simulator import Scene
-from vpd_lightning.types import Particles
+from vpd_lightning.types import HiddenSide, Particles
 
 
 @torch.no_grad()
@@ -35,7 +35,7 @@ def drawn_references(
         NOTHING_MOVES: [current] * num_steps,
         TRUE_VELOCITY: _carried(current, bodies, [_kept_velocity(body, num_steps) for body in bodies], num_steps),
         TRUE_MOTION: [
-            replace(state, features=predicted.features)
+            _with_features_of(predicted, state)
             for state, predicted in zip(
                 _carried(current, bodies, [body.true for body in bodies], num_steps),
                 simulator.rollout(scene, num_steps),
@@ -71,19 +71,53 @@ def _kept_velocity(body: Body, num_steps: int) -> Float[Tensor, "time body_parti
 def _carried(
     current: Particles, bodies: list[Body], places: list[Float[Tensor, "time body_particle 3"]], num_steps: int
 ) -> list[Particles]:
-    """Move the particles of bodies to their places after each step; normals turn as the body does."""
+    """Move the particles of bodies to their places after each step; normals and hidden sides turn as the body does."""
+    owners = _nearest_bodies(current, bodies)
     rows = current.mask[0].nonzero().flatten().cpu()
     states = []
     for step in range(1, num_steps + 1):
         positions = current.positions.clone()
         normals = None if current.normals is None else current.normals.clone()
-        for body, path in zip(bodies, places, strict=True):
+        side = current.hidden_side
+        for number, (body, path) in enumerate(zip(bodies, places, strict=True)):
             own = rows[body.mask].to(positions.device)
             if not len(own):
                 continue
             positions[0, own] = path[step].to(positions)
+            rotation = best_rotation(path[0], path[step][None])[0]
             if normals is not None:
-                rotation = best_rotation(path[0], path[step][None])[0].to(normals)
+                rotation = rotation.to(normals)
                 normals[0, own] = current.normals[0, own] @ rotation.T  # type: ignore[index]
-        states.append(replace(current, positions=positions, normals=normals))
+            if side is not None:
+                side = _turned(side, owners == number, path[0].mean(0), path[step].mean(0), rotation)
+        states.append(replace(current, positions=positions, normals=normals, hidden_side=side))
     return states
+
+
+def _nearest_bodies(current: Particles, bodies: list[Body]) -> Int64[Tensor, " hidden"]:
+    """Return for each particle of the hidden side the body that has the nearest particle; -1 without bodies."""
+    if current.hidden_side is None or not any(len(body.true[0]) for body in bodies):
+        return torch.full((0 if current.hidden_side is None else current.hidden_side.mask.shape[1],), -1)
+    places = current.hidden_side.positions[0].cpu().double()
+    nearest = [
+        (places[:, None] - body.true[0].double()).square().sum(dim=-1).amin(dim=1)
+        if len(body.true[0])
+        else torch.full_like(places[:, 0], torch.inf)
+        for body in bodies
+    ]
+    return torch.stack(nearest).argmin(dim=0)
+
+
+def _turned(side: HiddenSide, own: Tensor, before: Tensor, after: Tensor, rotation: Tensor) -> HiddenSide:
+    """Return a hidden side whose own particles moved as a body that turned about its particles' mean."""
+    before, after, rotation = (part.to(side.positions) for part in (before, after, rotation))
+    chosen = own.to(side.mask.device)[:, None]
+    positions = torch.where(chosen, (side.positions - before) @ rotation.T + after, side.positions)
+    return replace(side, positions=positions, normals=torch.where(chosen, side.normals @ rotation.T, side.normals))
+
+
+def _with_features_of(predicted: Particles, state: Particles) -> Particles:
+    side = state.hidden_side
+    if side is not None and predicted.hidden_side is not None:
+        side = replace(side, features=predicted.hidden_side.features)
+    return replace(state, features=predicted.features, hidden_side=side)

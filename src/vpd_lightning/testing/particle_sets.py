@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from vpd_lightning.types import Particles, Rays
+from vpd_lightning.types import OTHER_AXES, Particles, Rays
 
 SHIFT = (3.0, -2.0, 1.0)  # metres
 _NUM_PADDING = 3  # slots before the particles, and as many behind them
@@ -75,7 +75,7 @@ def padded_inside(particles: Particles) -> Particles:
         values = [getattr(part, name) for part in parts]
         return None if values[0] is None else torch.cat(values, dim=1)
 
-    names = [item.name for item in fields(Particles) if item.name not in ("scenery", "occluders")]
+    names = [item.name for item in fields(Particles) if item.name not in OTHER_AXES]
     return _with_padding_masked(Particles(**{name: joined(name) for name in names}, scenery=particles.scenery))
 
 

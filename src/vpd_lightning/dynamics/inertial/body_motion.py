@@ -151,3 +151,14 @@ def body_inertia(
         inverse_moments=torch.linalg.inv(moments) * inertia_ratio,
         softness=softness,
     )
+
+
+def body_volumes(positions: Tensor, centers: Tensor, shares: Tensor) -> Float[Tensor, "batch body 1"]:
+    """Return the cube of each body's root mean square radius, to which its volume is in proportion (cubic metres).
+
+    A place without a body gets 1: masses are divided by.
+    """
+    offsets = positions[:, None] - centers[:, :, None]
+    square = (shares * offsets.square().sum(dim=-1)).sum(dim=-1, keepdim=True)
+    there = shares.sum(dim=-1, keepdim=True) > 0
+    return torch.where(there, square.clamp(min=1e-18), 1.0) ** 1.5

@@ -1,16 +1,16 @@
 """Inertial dynamics: what moves keeps moving, as rigid or soft bodies; networks learn forces and materials."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.inertial.body_forces import BodyForces
-from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, matrices_of, vectors_of
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, body_volumes, matrices_of, vectors_of
 from vpd_lightning.dynamics.inertial.contact import (
     BodyContacts,
     ContactPoints,
@@ -21,7 +21,9 @@ from vpd_lightning.dynamics.inertial.contact import (
 )
 from vpd_lightning.dynamics.inertial.first_motion import find_first_motion, gather_index, movable, observed, put, take
 from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity, Surfels
+from vpd_lightning.dynamics.inertial.hidden_side import HiddenGuess, hidden_after
 from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
+from vpd_lightning.dynamics.inertial.memory import InertialMemory
 from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, fit_twists, rotate, rotation_from_spin
 from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
 from vpd_lightning.geometry.spacing import point_spacing
@@ -34,30 +36,6 @@ _PAIR_REACH = 1.5
 
 _BOUNCE_SHARE = 0.3
 """Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, so that bodies come to rest."""
-
-
-@dataclass(frozen=True)
-class InertialMemory:
-    """What the inertial dynamics carries from step to step; gathered over the particles that may move."""
-
-    origin: Float[Tensor, "batch 1 3"]  # metres, world; origin of all other positions
-    index: Int[Tensor, "batch moving"]  # slots of the moving candidates among all particles
-    mask: Bool[Tensor, "batch moving"]
-    bodies: Float[Tensor, "batch body moving"]  # 1 where a particle belongs to a body, else 0
-    own: Int[Tensor, "batch moving"]  # the number of that body; 0 for padding
-    motion: BodyMotion  # the velocity with which bodies go into the next step
-    materials: Materials
-    masses: Float[Tensor, "batch body 1"]
-    spacing: Float[Tensor, " batch"]  # of the moving candidates (metres)
-    normals: Float[Tensor, "batch moving 3"]
-    velocities: Float[Tensor, "batch moving 3"]  # metres a step; used with keep_shape=false only
-    mirrored: Bool[Tensor, "batch moving"]  # true if its mirror image may lie on the hidden side
-    first_features: Float[Tensor, "batch moving feature"]
-    first_shade: Float[Tensor, "batch moving feature"]
-    static_index: Int[Tensor, "batch static"]
-    static_mask: Bool[Tensor, "batch static"]
-    static_features: Float[Tensor, "batch static feature"]
-    static_shade: Float[Tensor, "batch static feature"]  # with the moving ones where they were at first
 
 
 class InertialDynamics(AbstractDynamics):
@@ -73,6 +51,9 @@ class InertialDynamics(AbstractDynamics):
 
     Neither gravity nor a floor is built in: at initialisation this is free motion, changed by contact and by 0.7 % of
     damping a step alone.
+
+    With ``guess_hidden`` (and ``keep_shape`` and ``carry_memory``) the renderer gets what no camera saw of a body, too:
+    mirror images through its centre (``Particles.hidden_side``).
 
     For comparisons, each part can be left out: with ``first_velocity`` null bodies start at rest; with ``keep_shape``
     false every particle goes on with its own velocity, to which it adds what its body's changes by; with
@@ -109,6 +90,8 @@ class InertialDynamics(AbstractDynamics):
         keep_shape: bool,
         carry_memory: bool,
         shadow_scales: Sequence[float] | None,
+        extent_weight: float,
+        guess_hidden: bool,
     ):
         super().__init__()
         for name, value in (("num_bodies", num_bodies), ("num_probes", num_probes)):
@@ -117,9 +100,10 @@ class InertialDynamics(AbstractDynamics):
         for name, scale in (("body_link", body_link), ("location_scale", location_scale), ("force_scale", force_scale)):
             if scale <= 0:
                 raise ValueError(f"{name} must be positive, got {scale}")
-        if rest_share < 0 or residual_share < 0:
+        if min(rest_share, residual_share, extent_weight) < 0:
             raise ValueError(
-                f"rest_share and residual_share must not be negative, got {rest_share} and {residual_share}"
+                "rest_share, residual_share and extent_weight must not be negative, "
+                f"got {rest_share}, {residual_share} and {extent_weight}"
             )
         self.num_bodies, self.num_probes = num_bodies, num_probes
         self.body_link, self.max_concavity, self.max_concave_share = body_link, max_concavity, max_concave_share
@@ -127,7 +111,7 @@ class InertialDynamics(AbstractDynamics):
         self.contact_range, self.contact_reach = contact_range, contact_reach
         self.num_contact_iterations, self.max_contact_depth = num_contact_iterations, max_contact_depth
         self.mirror_hidden, self.keep_shape, self.carry_memory = mirror_hidden, keep_shape, carry_memory
-        self.first_velocity = first_velocity
+        self.first_velocity, self.extent_weight = first_velocity, extent_weight
         self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
         self.forces = BodyForces(
             hidden_dim=hidden_dim,
@@ -140,6 +124,8 @@ class InertialDynamics(AbstractDynamics):
         )
         self.materials = MaterialNetwork(feature_dim=feature_dim, hidden_dim=hidden_dim, is_soft=is_soft)
         self.moving_shading = MovingShading(feature_dim=feature_dim, hidden_dim=hidden_dim)
+        is_guessing = guess_hidden and keep_shape and carry_memory
+        self.hidden_guess = HiddenGuess(feature_dim=feature_dim) if is_guessing else None
         self.static_shading = None
         if shadow_scales is not None:
             self.static_shading = StaticShading(feature_dim=feature_dim, hidden_dim=hidden_dim, scales=shadow_scales)
@@ -168,12 +154,15 @@ class InertialDynamics(AbstractDynamics):
         index, mask, seen, bodies = found.index, found.mask, found.seen, found.bodies
         shares = bodies / bodies.sum(dim=-1, keepdim=True).clamp(min=1)
         with torch.no_grad():
-            centers = equidistant_centers(seen.positions, seen.normals, shares)
+            centers = equidistant_centers(seen.positions, seen.normals, shares, self.extent_weight)
             static_index, static_mask = gather_index(current.mask & ~movable(current))
             static_positions = take(current.positions, static_index)
             mirrored = mask & self._may_be_hidden(current, seen, bodies, centers, static_index, static_mask)
             spacing = point_spacing(seen.positions, mask)
         materials = self.materials(seen.features, shares)
+        hidden = None
+        if self.hidden_guess is not None:
+            hidden = self.hidden_guess(seen, bodies, found.own, centers, mirrored, self.moving_shading)
         static_features = take(current.features, static_index)
         return InertialMemory(
             origin=origin,
@@ -183,7 +172,7 @@ class InertialDynamics(AbstractDynamics):
             own=found.own,
             motion=_first_motion(seen.positions, found.matched.displacements, shares, centers),
             materials=materials,
-            masses=materials.density * _volumes(seen.positions, centers, shares),
+            masses=materials.density * body_volumes(seen.positions, centers, shares),
             spacing=spacing,
             normals=seen.normals,
             velocities=found.matched.displacements,
@@ -198,6 +187,7 @@ class InertialDynamics(AbstractDynamics):
                 if self.static_shading is None
                 else self.static_shading(static_features, static_positions, seen.positions, mask)
             ),
+            hidden=hidden,
         )
 
     def _may_be_hidden(
@@ -213,6 +203,17 @@ class InertialDynamics(AbstractDynamics):
         mirrored = 2 * (bodies[..., None] * centers[:, :, None]).sum(dim=1) - seen.positions
         places, normals = take(current.positions, static_index), take(current.normals, static_index)  # type: ignore[arg-type]
         return nearest_static_contacts(mirrored, places, normals, static_mask, self.contact_reach).distances > 0
+
+    def completed(self, previous: Particles, current: Particles, keys: RandomKeys) -> Particles:
+        """Return the current particles with what is guessed of the hidden sides of bodies."""
+        if self.hidden_guess is None or current.num_particles == 0:
+            return current
+        memory = self.initialize(previous, current, keys)
+        assert memory.hidden is not None
+        positions, centers = take(current.positions, memory.index) - memory.origin, memory.motion.centers
+        unturned = rotation_from_spin(torch.zeros_like(centers))
+        _, side = hidden_after(memory.hidden, positions, centers, unturned, self.moving_shading, memory.origin)
+        return replace(current, hidden_side=side)
 
     def forward(
         self, previous: Particles, current: Particles, memory: Any, keys: RandomKeys, rollout_step: int
@@ -239,16 +240,21 @@ class InertialDynamics(AbstractDynamics):
             velocities = velocities + moved - _carried(memory.motion, positions, own)
             moved = positions + velocities
         following = torch.where(memory.mask[..., None], moved, positions)
-        turned = rotate(matrices_of(rotation_from_spin(step.spins), own), memory.normals)
+        rotations = rotation_from_spin(step.spins)
+        turned = rotate(matrices_of(rotations, own), memory.normals)
         all_positions = put(current.positions, memory.index, following + memory.origin, memory.mask)
         features = self._shade(current, memory, static_positions, following, turned)
         stretches, _ = step.following_stretches()
         _, strains = onward.following_stretches()
         onward = BodyMotion(step.centers + step.displacements, onward.displacements, onward.spins, stretches, strains)
-        memory = replace(memory, motion=onward, normals=turned, velocities=velocities)
+        hidden, side = memory.hidden, None
+        if hidden is not None:
+            places = (following, onward.centers, rotations)
+            hidden, side = hidden_after(hidden, *places, self.moving_shading, memory.origin)
+        memory = replace(memory, motion=onward, normals=turned, velocities=velocities, hidden=hidden)
         # Normals rotate with their bodies: a memory rebuilt from these particles needs those of the new pose.
         normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
-        return replace(current, positions=all_positions, features=features, normals=normals), memory
+        return replace(current, positions=all_positions, features=features, normals=normals, hidden_side=side), memory
 
     def _resolved(
         self, positions: Tensor, static_positions: Tensor, normals: Tensor, memory: InertialMemory
@@ -372,17 +378,6 @@ def _first_motion(positions: Tensor, displacements: Tensor, shares: Tensor, cent
         stretches=eye,
         strains=torch.zeros_like(eye),
     )
-
-
-def _volumes(positions: Tensor, centers: Tensor, shares: Tensor) -> Float[Tensor, "batch body 1"]:
-    """Return the cube of each body's root mean square radius, to which its volume is in proportion (cubic metres).
-
-    A place without a body gets 1: masses are divided by.
-    """
-    offsets = positions[:, None] - centers[:, :, None]
-    square = (shares * offsets.square().sum(dim=-1)).sum(dim=-1, keepdim=True)
-    there = shares.sum(dim=-1, keepdim=True) > 0
-    return torch.where(there, square.clamp(min=1e-18), 1.0) ** 1.5
 
 
 def _elastic(motion: BodyMotion, materials: Materials) -> Float[Tensor, "batch body 3 3"]:

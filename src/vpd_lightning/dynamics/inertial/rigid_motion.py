@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,15 @@ def equidistant_centers(
     positions: Float[Tensor, "batch particle 3"],
     normals: Float[Tensor, "batch particle 3"],
     weights: Float[Tensor, "batch anchor particle"],
+    extent_weight: float = 0.0,
 ) -> Float[Tensor, "batch anchor 3"]:
     """Find the point at equal distance from all tangent planes: the centre of a ball or cube of which a part is seen.
 
-    Least squares of n . (x - c) = h over (c, h). Where the seen surface leaves a direction open (one face), a weak
-    pull towards the particles' mean decides. The mean itself would be off by what is hidden, and a spinning body
-    would be carried around the wrong point.
+    Least squares of n . (x - c) = h over (c, h). Three faces of a cube leave the distance h open. So each particle also
+    asks with ``extent_weight`` that the centre lie midway between the first and the last of its anchor's particles
+    along its normal: of a cube, the other faces show how deep it is. Where even that leaves a direction open (one
+    face), a weak pull towards the particles' mean decides. The mean itself would be off by what is hidden, and a
+    spinning body would be carried around the wrong point.
     """
     known = weights * (normals.square().sum(dim=-1) > 0.5)[:, None]
     known = known / known.sum(dim=-1, keepdim=True).clamp(min=1e-12)
@@ -64,11 +67,35 @@ def equidistant_centers(
     matrix = torch.einsum("bap,bpi,bpj->baij", known, rows, rows)
     right = torch.einsum("bap,bpi,bap->bai", known, rows, heights)
     pull = torch.diag(positions.new_tensor([0.01, 0.01, 0.01, 1e-4]))
+    if extent_weight > 0:
+        pull = pull / 10  # what is left open is little
+        level = nn.functional.pad(normals, (0, 1))
+        middles = _middles(positions, normals, weights)[:, None] - (normals[:, None] * mean[:, :, None]).sum(dim=-1)
+        matrix = matrix + extent_weight * torch.einsum("bap,bpi,bpj->baij", known, level, level)
+        right = right + extent_weight * torch.einsum("bap,bpi,bap->bai", known, level, middles)
     offset = torch.linalg.solve(matrix + pull, right)[..., :3]
     reach = weighted_sum(weights, positions.square()).sum(-1) - mean.square().sum(-1)
     limit = reach.clamp(min=1e-12).sqrt()[..., None]  # never farther than the particles themselves reach
     length = offset.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
     return mean + offset * (limit / length).clamp(max=1)
+
+
+_STRAYS = 0.01
+"""Share of the particles at either end that do not count for a body's extent."""
+
+
+def _middles(positions: Tensor, normals: Tensor, weights: Tensor) -> Float[Tensor, "batch particle"]:
+    """Return where along its normal each particle's anchor has its middle (n . x, metres)."""
+    belongs = (weights > 0).to(positions.dtype)
+    others = belongs.mT @ belongs == 0
+    heights = normals @ positions.mT
+    rank = max(1, round(_STRAYS * positions.shape[1]))
+    highest = heights.masked_fill(others, -torch.inf).topk(rank, dim=-1).values
+    lowest = heights.masked_fill(others, torch.inf).topk(rank, dim=-1, largest=False).values
+    # An anchor of fewer particles than that has all of them among these.
+    high = torch.where(highest.isfinite(), highest, torch.inf).amin(dim=-1)
+    low = torch.where(lowest.isfinite(), lowest, -torch.inf).amax(dim=-1)
+    return torch.where(high.isfinite() & low.isfinite(), (high + low) / 2, 0.0)
 
 
 def _inertia(offsets: Tensor, weights: Tensor) -> Tensor:
