@@ -32,9 +32,9 @@ def encoded(model, data, purpose="current"):
 
 
 def still_pixels():
-    """Which pixels stand still beside the body: all but it and those around it."""
+    """Which pixels stand still beside the body: all but it, those around it, and those of the edge beside these."""
     still = torch.ones(2, 2, 8, 8, dtype=torch.bool)
-    still[0, 1, 1:5, 1:5] = False
+    still[0, 1, :5, :5] = False
     return still
 
 
@@ -56,6 +56,30 @@ def test_points_are_the_pixels_that_neither_move_nor_touch_what_moves():
     normals = depth_normals(closer.depth, closer.cameras).flatten(1, 3)
     assert torch.equal(scenery.normals[still], normals[still])
     assert (scenery.normals[..., 2] > 0.99).sum() > 100
+
+
+def test_a_sliver_of_a_body_at_the_edge_is_no_scenery():
+    """Outermost pixels have no normal; what leaves the plane beside them is not known to stand still."""
+    data, closer = with_a_body()
+    # Behind the floor, so that the background does not find them.
+    closer.depth[0, 0, 0, 2:5] = 2.3  # a row of a body that is mostly outside of the picture
+    closer.depth[1, 0, 3, 7] = 2.2
+
+    mask = encoded(encoder(data), closer).scenery.mask.unflatten(1, (2, 8, 8))
+
+    expected = still_pixels()
+    expected[0, 0, 0, 2:5] = expected[1, 0, 3, 7] = False
+    assert torch.equal(mask, expected)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5, 1.2])
+def test_a_plane_goes_on_to_the_edge_however_it_is_tilted(tilt):
+    data, _ = with_a_body()
+    rows = (torch.arange(8) + 0.5 - 4) / 12.5  # y over z
+    tilted = replace(data, depth=(2 / (1 + tilt * rows))[:, None].expand_as(data.depth).contiguous())
+    model = encoder(tilted, workspace_min=[-9, -9, -9], workspace_max=[9, 9, 9])
+
+    assert encoded(model, tilted).scenery.mask.all()
 
 
 def test_points_may_lie_outside_of_the_workspace_where_particles_do_not():

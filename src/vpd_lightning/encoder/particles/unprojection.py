@@ -18,6 +18,9 @@ from vpd_lightning.geometry.workspace import inside_workspace
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles, RGBDFrames, require_finite
 
+_EDGE_STEP = 0.05
+"""Share of its depth by which a surface may leave its tangent plane in the outermost pixel of a picture."""
+
 
 class UnprojectingEncoder(AbstractEncoder):
     """Base of encoders whose particles are pixels: it chooses and unprojects them. A subclass computes features.
@@ -114,6 +117,7 @@ class UnprojectingEncoder(AbstractEncoder):
             dynamic_mask = self.background(_cropped(frames, candidates))
             moving, border = (pixels.flatten(1) for pixels in _with_border(dynamic_mask))
             candidates, still = candidates & ~border, measured & ~moving & ~border
+            still = _going_on(still.view_as(frames.depth), frames.depth).flatten(1)
             far = far & ~border  # a mixture of a body and what is behind it
         index, valid = self._choose(candidates, moving, keys, purpose)
         normals = None
@@ -193,6 +197,26 @@ def _cropped(frames: RGBDFrames, candidates: Bool[Tensor, "batch point"]) -> RGB
     """Return the frames with depth at the candidates only: how wide a floor is must not depend on the horizon."""
     kept = candidates.view_as(frames.depth)
     return replace(frames, depth=torch.where(kept, frames.depth, 0.0))
+
+
+def _going_on(still: Bool[Tensor, "batch view height width"], depth: Tensor) -> Bool[Tensor, "batch view height width"]:
+    """Return what stands still without outermost pixels in which the surface beside them does not go on.
+
+    They have no normal, so none of them is ever found to move: a body of which the picture's edge shows a sliver would
+    hang in the air. The inverse depth of a plane is linear in the picture.
+    """
+    nearness = torch.where(still, 1 / depth, 0.0)  # 1/m
+    still = still.clone()
+    for axis in (-1, -2):
+        size = still.shape[axis]
+        if size < 3:
+            continue
+        outer, beside, inner = (torch.tensor([n, size - 1 - n], device=depth.device) for n in range(3))
+        places = [nearness.index_select(axis, rows) for rows in (outer, beside, inner)]
+        known = still.index_select(axis, beside) & still.index_select(axis, inner)
+        goes_on = (places[0] - 2 * places[1] + places[2]).abs() < _EDGE_STEP * places[1]
+        still.index_copy_(axis, outer, still.index_select(axis, outer) & known & goes_on)
+    return still
 
 
 def _with_border(moving: Bool[Tensor, "batch view height width"]) -> tuple[Tensor, Tensor]:
