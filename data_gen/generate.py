@@ -15,8 +15,11 @@ from data_gen.dataset_folder import DatasetFolder
 from data_gen.pool import num_cores, run_jobs
 from data_gen.progress import Progress
 from data_gen.settings import load_preset, load_settings
+from data_gen.simulated_sensor import rendered_settings
 from data_gen.stage_clock import STAGES
 from vpd_lightning.data.manifest import file_sha256
+from vpd_lightning.data.sensors import SensorSettings, load_sensor
+from vpd_lightning.data.sensors.settings import NO_SENSOR
 from vpd_lightning.errors import ConfigError
 
 _PACKAGES = ("mujoco", "numpy", "h5py", "vpd-lightning")
@@ -36,6 +39,7 @@ class Plan:
     out: Path
     settings: Any
     scene_version: int
+    sensor: SensorSettings | None = None
 
     @property
     def folder(self) -> DatasetFolder:
@@ -46,6 +50,8 @@ class Plan:
         recipe = {"scene_version": self.scene_version, **asdict(self.settings)}
         for group, name in self.settings.PLACES:
             recipe[group].pop(name)
+        if self.sensor is not None:
+            recipe["sensor"] = asdict(self.sensor)
         return DatasetFolder(self.out, {"scene": self.scene, "seed": self.seed, **recipe})
 
     def files(self) -> dict[str, list[Path]]:
@@ -62,6 +68,7 @@ def generate(
     renderer: str | None = None,
     workers: int | None = None,
     overrides: Mapping[str, Any] | None = None,
+    sensor: str = NO_SENSOR,
 ) -> Path:
     """Generate a data set and return its folder; complete files of an interrupted run are kept.
 
@@ -72,7 +79,8 @@ def generate(
         seed: the same seed gives the same physics anywhere, and the same bytes on one machine.
         renderer: ``auto`` (EGL, then OSMesa), ``egl``, ``osmesa`` or ``raycast``; ``None`` takes the preset's.
         workers: processes; ``None`` takes all cores this process may use. It never changes the data.
-        overrides: settings by (dotted) name, for example ``{"splits.train": 8}``.
+        overrides: settings by (dotted) name, for example ``{"splits.train": 8}``; of the sensor: ``sensor.NAME``.
+        sensor: file in ``conf/sensor``: what the cameras get wrong.
 
     Raises:
         ConfigError: unknown names or values out of range.
@@ -86,7 +94,9 @@ def generate(
         raise ConfigError(f"workers is {workers}; at least 1 is needed.")
     if not 0 <= seed < 2**63:
         raise ConfigError(f"seed is {seed}; allowed: 0 to 2^63 - 1.")
-    plan = make_plan(scene, preset, Path(out).expanduser().absolute(), seed, changes)
+    errors = {key: changes.pop(key) for key in list(changes) if key.startswith("sensor.")}
+    chosen = load_sensor(sensor, {key.removeprefix("sensor."): value for key, value in errors.items()})
+    plan = make_plan(scene, preset, Path(out).expanduser().absolute(), seed, changes, chosen)
     folder, files = plan.folder, plan.files()
     if folder.is_complete():
         print(f"{plan.out} is complete already.")
@@ -135,12 +145,16 @@ def _speed(plan: Plan, made: Sequence[worker.MadeFile], elapsed: float, num_work
     )
 
 
-def make_plan(scene: str, preset: str, out: Path, seed: int, overrides: Mapping[str, Any]) -> Plan:
+def make_plan(
+    scene: str, preset: str, out: Path, seed: int, overrides: Mapping[str, Any], sensor: SensorSettings | None = None
+) -> Plan:
     """Check all settings and return what would be made."""
     family, _ = load_preset(scene, preset)
     module = import_module(f"data_gen.{family}")
     settings = load_settings(module.Settings, scene, preset, overrides)
-    return Plan(scene, family, preset, seed, out, settings, module.VERSION)
+    if sensor is not None:
+        rendered_settings(settings, sensor)  # fails here once rather than in each worker
+    return Plan(scene, family, preset, seed, out, settings, module.VERSION, sensor)
 
 
 def _make(
@@ -154,7 +168,7 @@ def _make(
     """Make the missing files and say what is known of them; in this process where one worker and no GL are enough."""
     made: dict[Path, worker.MadeFile] = {}
     if num_workers == 1 and backend == "raycast":
-        worker.start(plan.family, plan.settings, backend, None)
+        worker.start(plan.family, plan.settings, backend, plan.sensor, None)
         try:
             for (split, index), path in missing.items():
                 made[path] = worker.make_file(plan.seed, split, index, path, scene_hash)
@@ -163,7 +177,7 @@ def _make(
             worker.stop()
         return made
     jobs = {path: (plan.seed, split, index, path, scene_hash) for (split, index), path in missing.items()}
-    arguments = (plan.family, plan.settings, backend)
+    arguments = (plan.family, plan.settings, backend, plan.sensor)
     return run_jobs(jobs, arguments, worker.environment(backend), num_workers, advance)
 
 

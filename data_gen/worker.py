@@ -8,7 +8,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
 
+from data_gen.simulated_sensor import measured, rendered_settings
 from data_gen.stage_clock import StageClock
+from vpd_lightning.data.sensors import SensorSettings
 
 _state: dict[str, Any] = {}
 
@@ -34,7 +36,9 @@ def environment(backend: str) -> dict[str, str]:
     return variables
 
 
-def start(family: str, settings: Any, backend: str, stop_event: StopEvent | None) -> None:
+def start(
+    family: str, settings: Any, backend: str, sensor: SensorSettings | None, stop_event: StopEvent | None
+) -> None:
     """Build the scene of this process.
 
     With a ``stop_event`` this is a worker: Ctrl-C is left to the parent, which sets the event, and SIGTERM is noted and
@@ -46,7 +50,9 @@ def start(family: str, settings: Any, backend: str, stop_event: StopEvent | None
         signal.signal(signal.SIGTERM, _note)
         if hasattr(signal, "pthread_sigmask"):
             signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
-    _state["scene"] = import_module(f"data_gen.{family}").Scene(settings, backend)
+    rendered = settings if sensor is None else rendered_settings(settings, sensor)
+    _state["scene"] = import_module(f"data_gen.{family}").Scene(rendered, backend)
+    _state["sensor"], _state["settings"] = sensor, settings
     _state["storage"] = settings.storage
     _state["stop"] = stop_event
     _state["parent"] = os.getppid()
@@ -74,6 +80,9 @@ def make_file(seed: int, split: str, index: int, path: Path, scene_hash: str) ->
 
     clock, storage = StageClock(), _state["storage"]
     trajectory = _state["scene"].trajectory(seed, split, index, scene_hash, _check_stop, clock)
+    if _state["sensor"] is not None:
+        with clock.measure("render"):
+            trajectory = measured(trajectory, _state["settings"], _state["sensor"], seed, f"{split}/{index:06d}")
     with clock.measure("write"):
         write_trajectory(path, trajectory, compression=storage.compression, depth_encoding=storage.depth_encoding)
         sha256 = file_sha256(path)

@@ -19,9 +19,15 @@ SMALL = {
 }
 
 
-def generate_small(out: Path, *, seed: int = 0, workers: int = 1, **overrides: Any) -> Path:
+def generate_small(out: Path, *, seed: int = 0, workers: int = 1, sensor: str = "none", **overrides: Any) -> Path:
     return generate(
-        scene="mujoco_block", preset="tiny", out=out, seed=seed, workers=workers, overrides={**SMALL, **overrides}
+        scene="mujoco_block",
+        preset="tiny",
+        out=out,
+        seed=seed,
+        workers=workers,
+        sensor=sensor,
+        overrides={**SMALL, **overrides},
     )
 
 

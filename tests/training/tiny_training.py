@@ -149,6 +149,8 @@ def tiny_data(folder: Path, **changes: Any) -> VideoDataModule:
         "num_validation_steps": 2,
         "validation_views": [0],
         "load_future": False,
+        "sensor": "none",
+        "sensor_percent": None,
     }
     return VideoDataModule(**{**settings, **changes})
 

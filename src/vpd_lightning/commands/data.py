@@ -10,7 +10,7 @@ from vpd_lightning.commands.data_help import HELP
 from vpd_lightning.commands.report_errors import run_command
 from vpd_lightning.errors import ConfigError, DataError
 
-_TEXT_SETTINGS = ("out", "scene", "preset", "renderer", "format", "mapping", "pixel_center", "up")
+_TEXT_SETTINGS = ("out", "scene", "preset", "renderer", "format", "mapping", "pixel_center", "up", "sensor")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -77,6 +77,7 @@ def _generate(places: Sequence[str], settings: dict[str, Any]) -> int:
         seed=_whole_number("seed", settings.pop("seed", 0)),
         renderer=settings.pop("renderer", None),
         workers=_whole_number("workers", settings.pop("workers")) if "workers" in settings else None,
+        sensor=settings.pop("sensor", "none"),
         overrides=settings,
     )
     return 0

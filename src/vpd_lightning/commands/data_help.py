@@ -17,6 +17,7 @@ HELP = f"""vpd-data: make, bring in, look at and check data sets of posed RGB-D 
       preset    paper: the paper's counts and sizes (half an hour to 90 minutes on two cores); tiny: seconds
       renderer  auto (EGL, then OSMesa), egl, osmesa, blender (docs/blender.md), raycast (mujoco_block without GL)
       workers   processes; all cores by default; never changes the data
+      sensor    none, structured_light, active_stereo, time_of_flight: what the cameras get wrong (docs/datasets.md)
       SETTING   any setting of the preset, for example splits.train=8 camera.num_views=4 block.side=0.2
 
   vpd-data import SOURCE out=FOLDER [format=auto] [SETTING=VALUE ...]

@@ -20,6 +20,7 @@ _ONLY_WITH: dict[str, tuple[str, Callable[[Any], bool], str]] = {
     "renderer.normalization_epsilon": ("renderer.kernel_normalization", lambda value: value == "eps", "eps"),
     "data.moving_ray_margin": ("data.moving_ray_fraction", bool, "more than 0"),
     "data.moving_color_threshold": ("data.moving_ray_fraction", bool, "more than 0"),
+    "data.sensor_percent": ("data.sensor", lambda name: name != "none", "not none"),
     "data.moving_depth_threshold": ("data.moving_ray_fraction", bool, "more than 0"),
     "data.num_validation_steps": ("data.num_validation_clips", bool, "more than 0"),
     "data.validation_views": ("data.num_validation_clips", bool, "more than 0"),

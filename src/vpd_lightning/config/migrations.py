@@ -57,6 +57,8 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "num_occluders": 512,
         "shadow_softness": 0.5,
     },
+    "vpd_lightning.data.datamodule.VideoDataModule": {"sensor": "none", "sensor_percent": None},
+    "vpd_lightning.data.views.view_datamodule.ViewDataModule": {"sensor": "none", "sensor_percent": None},
     "vpd_lightning.encoder.unet.UNetEncoder": {"color_features": False, "same_pixels": False, "has_scenery": False},
 }
 """By class: arguments added since the first checkpoints, with values that leave those models as they were."""

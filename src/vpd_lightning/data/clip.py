@@ -1,7 +1,7 @@
 """One recorded clip as it is read from disk: the frames that a model is shown and those to predict."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +50,19 @@ class Clip:
         window = slice(self.current_frame, self.current_frame + num_steps + 1)
         poses = np.concatenate([self.state.positions[window], self.state.quaternions[window]], axis=-1)
         return torch.from_numpy(poses)
+
+    def true_depth(self, step: int) -> tuple[Float[Tensor, "view height width"], Cameras]:
+        """Return z-depth in metres and cameras of the last input frame (step 0) or of the ``step``-th one after it.
+
+        Where a sensor was simulated they are those without its errors; of a recording, those measured.
+        """
+        depth, cameras = self.depth[-1], self.cameras[-1]
+        if step:
+            depth, cameras = self.target_depth[step - 1], self.target_cameras[step - 1]
+        if self.state is None or self.state.depth is None or self.state.cam_to_world is None:
+            return depth, cameras
+        poses = torch.from_numpy(self.state.cam_to_world).to(cameras.cam_to_world)
+        return torch.from_numpy(self.state.depth[self.current_frame + step]), replace(cameras, cam_to_world=poses)
 
     def previous_pose(self) -> Float[Tensor, "object 7"]:
         """True poses at the frame before the last input frame."""

@@ -17,6 +17,8 @@ from vpd_lightning.data.dataset import ClipDataset, MovingRays
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.data.sampler import StepBatchSampler, StepLoader
+from vpd_lightning.data.sensors import load_sensor
+from vpd_lightning.data.sensors.noisy_frames import NoisyFrames
 from vpd_lightning.data.validation import ValidationClips, VideoClip
 from vpd_lightning.errors import ConfigError, DataError
 from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras, VideoBatch
@@ -33,7 +35,9 @@ class VideoDataModule(pl.LightningDataModule):
     training median by more than the thresholds (largest colour channel, in [0, 1]; depth, in metres), or lie within
     ``moving_ray_margin`` pixels of one that does. With ``cache`` decoded frames stay in memory (in each loader worker;
     with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
-    the input views' images of the frames to predict.
+    the input views' images of the frames to predict. ``sensor`` names a simulated sensor (``conf/sensor``) whose errors
+    the training clips get, ``sensor_percent`` its noise at each trajectory's median depth; validation clips stay as
+    they are.
     """
 
     def __init__(
@@ -59,6 +63,8 @@ class VideoDataModule(pl.LightningDataModule):
         num_validation_steps: int,
         validation_views: Sequence[int] | None,
         load_future: bool,
+        sensor: str,
+        sensor_percent: float | None,
     ) -> None:
         """Check the numbers; files are first touched by ``setup``."""
         super().__init__()
@@ -79,6 +85,8 @@ class VideoDataModule(pl.LightningDataModule):
         self.cache = cache
         self.num_validation_clips, self.num_validation_steps = num_validation_clips, num_validation_steps
         self.validation_views, self.load_future = validation_views, load_future
+        changes = {} if sensor_percent is None else {"percent_at_median": sensor_percent}
+        self.sensor = load_sensor(sensor, changes)
         self.num_context_frames = NUM_CONTEXT_FRAMES
         self.training_progress: Callable[[], float] | None = None
         self.data_sha256: str | None = None  # of the data set; known from setup on
@@ -100,7 +108,7 @@ class VideoDataModule(pl.LightningDataModule):
                 f"data.num_trajectories={wanted}, but {self.folder} has {len(files)} training trajectories.\n"
                 f"Use 1 to {len(files)}, or null for all."
             )
-        self.trajectories = [TrajectoryFrames(path, self.cache) for path in files[:wanted]]
+        self.trajectories = [self._frames(path) for path in files[:wanted]]
         self.trained_on = manifest.checksums(files[:wanted])
         if self.num_validation_clips:
             held_out = manifest.split("validation")[: self.num_validation_clips]
@@ -113,6 +121,11 @@ class VideoDataModule(pl.LightningDataModule):
                 target_views=self._views(self.validation_views),
                 start_frames=self.start_frames,
             )
+
+    def _frames(self, path: Path) -> TrajectoryFrames:
+        if self.sensor is None:
+            return TrajectoryFrames(path, self.cache)
+        return NoisyFrames(path, self.cache, self.sensor, self.seed)
 
     def _context_views(self) -> list[int]:
         return self.input_views

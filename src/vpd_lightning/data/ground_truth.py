@@ -33,6 +33,8 @@ class GroundTruth:
     vertices: NDArray[np.float32] | None = None  # (time, vertex, 3)
     vertex_objects: NDArray[np.int32] | None = None  # (vertex,)
     tetrahedra: NDArray[np.int32] | None = None  # (element, 4), indices into vertices
+    depth: NDArray[np.float32] | None = None  # (time, view, height, width) where a sensor was simulated
+    cam_to_world: NDArray[np.float64] | None = None  # (view, 4, 4) where a sensor was simulated
 
     @property
     def num_objects(self) -> int:
@@ -52,6 +54,7 @@ _SOFT_LAYOUT = {
     schema.STATE_VERTEX_OBJECTS: (np.int32, 1),
     schema.STATE_TETRAHEDRA: (np.int32, 2),
 }
+_CLEAN_LAYOUT = {schema.STATE_DEPTH: (np.float32, 4), schema.STATE_CAM_TO_WORLD: (np.float64, 3)}
 
 
 def has_state(path: str | Path) -> bool:
@@ -87,7 +90,8 @@ def read_state(path: str | Path) -> GroundTruth:
                 f"{path} has only a part of the ground truth of soft bodies ({', '.join(soft)}).\n"
                 f"{schema.STATE}/ needs {', '.join(_SOFT_LAYOUT)}, or none of them where bodies are rigid."
             )
-        arrays = _read(path, group, {**_LAYOUT, **(_SOFT_LAYOUT if soft else {})})
+        clean = {name: layout for name, layout in _CLEAN_LAYOUT.items() if name in group}
+        arrays = _read(path, group, {**_LAYOUT, **(_SOFT_LAYOUT if soft else {}), **clean})
     state = GroundTruth(**arrays)
     _check_meshes(path, state)
     return state

@@ -32,6 +32,8 @@ STATE_LINEAR_VELOCITIES = "linear_velocities"  # (time, object, 3) m/s, world, o
 STATE_ANGULAR_VELOCITIES = "angular_velocities"  # (time, object, 3) rad/s, world
 STATE_HALF_SIZES = "half_sizes"  # (object, 3) m, along the body's own axes
 STATE_SEGMENTATION = "segmentation"  # (time, view, height, width) uint8, 0 background, i + 1 object i
+STATE_DEPTH = "depth"  # (time, view, height, width) float32 m: without the errors of a simulated sensor
+STATE_CAM_TO_WORLD = "cam_to_world"  # (view, 4, 4) float64: as above
 STATE_VERTICES = "vertices"  # (time, vertex, 3) float32 m, world: soft bodies, all of them one after another
 STATE_VERTEX_OBJECTS = "vertex_objects"  # (vertex,) int32, the object each vertex belongs to
 STATE_TETRAHEDRA = "tetrahedra"  # (element, 4) int32, indices into vertices
@@ -105,7 +107,7 @@ def write_trajectory(
         if trajectory.state is not None:
             group = file.create_group(STATE)
             for name, values in trajectory.state.items():
-                if name == STATE_SEGMENTATION:
+                if name in (STATE_SEGMENTATION, STATE_DEPTH):
                     _write_images(group, name, values, compression)
                 else:
                     group.create_dataset(name, data=values)

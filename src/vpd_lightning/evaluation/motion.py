@@ -77,8 +77,8 @@ def true_points(clip: Clip, step: int, max_points: int) -> Float[Tensor, "point 
     At most ``max_points``, taken evenly over the pixels. Particles see the input views only, so the completeness of a
     model with few input views contains what those cannot see.
     """
-    depth = clip.target_depth[step]
-    points = unproject(depth, clip.target_cameras[step])
+    depth, cameras = clip.true_depth(step + 1)
+    points = unproject(depth, cameras)
     seen = torch.isfinite(depth) & (depth > 0)
     points = points[seen]
     points = points[inside_workspace(points, clip.workspace_min, clip.workspace_max)]

@@ -21,9 +21,9 @@ def floor_height(clip: Clip) -> float:
     equal above a level floor, and a few bad depths below it do not count.
     """
     assert clip.state is not None
-    depth = clip.depth[-1]
+    depth, cameras = clip.true_depth(0)
     static = torch.from_numpy(clip.state.segmentation[clip.current_frame]) == 0
-    points = unproject(depth, clip.cameras[-1])[static & torch.isfinite(depth) & (depth > 0)]
+    points = unproject(depth, cameras)[static & torch.isfinite(depth) & (depth > 0)]
     points = points[inside_workspace(points, clip.workspace_min, clip.workspace_max)]
     if points.shape[0] < _MIN_FLOOR_POINTS:
         return float("nan")
