@@ -20,7 +20,12 @@ NUM_PARTICLES = 60
 
 def encoder(has_background=True):
     background = WideSurfaceBackground(
-        max_slope=0.15, max_turn_degrees=20.0, min_width=0.4, tolerance=0.5, memory_frames=16
+        max_slope=0.15,
+        max_turn_degrees=20.0,
+        min_width=0.4,
+        tolerance=0.5,
+        memory_frames=16,
+        noise_floor=None,
     )
     return UNetEncoder(
         channels=[6, 8, 6, 8, 5],

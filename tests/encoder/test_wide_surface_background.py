@@ -9,7 +9,14 @@ from tests.geometry.cast_scenes import FLOOR, TWO_EYES, WALL, Ball, Box, Plane, 
 from vpd_lightning.encoder.particles.wide_surface_background import WideSurfaceBackground
 from vpd_lightning.testing.scenes import ball_frames
 
-SETTINGS = {"max_slope": 0.15, "max_turn_degrees": 20.0, "min_width": 0.4, "tolerance": 0.5, "memory_frames": 4}
+SETTINGS = {
+    "max_slope": 0.15,
+    "max_turn_degrees": 20.0,
+    "min_width": 0.4,
+    "tolerance": 0.5,
+    "memory_frames": 4,
+    "noise_floor": None,
+}
 
 
 def background(**changes):

@@ -59,6 +59,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
     },
     "vpd_lightning.data.datamodule.VideoDataModule": {"sensor": "none", "sensor_percent": None},
     "vpd_lightning.data.views.view_datamodule.ViewDataModule": {"sensor": "none", "sensor_percent": None},
+    "vpd_lightning.encoder.particles.wide_surface_background.WideSurfaceBackground": {"noise_floor": 0.001},
     "vpd_lightning.encoder.unet.UNetEncoder": {"color_features": False, "same_pixels": False, "has_scenery": False},
 }
 """By class: arguments added since the first checkpoints, with values that leave those models as they were."""

@@ -58,9 +58,10 @@ class Sensor:
         patches += (1 - _STATIC_SHARE**2) ** 0.5 * self._patches("hole in a frame", frame, view, true.shape)
         chance, mixture = generator.random(true.shape), generator.random(true.shape)
 
-        measured = true + self._bias(true, intrinsics, view)
-        measured = measured + self.noise(true) * noise
         edge, near, far = _edges(true, settings.edge_step)
+        # The normal of a pixel beside a jump is a mixture of two surfaces'.
+        measured = true + np.where(edge, 0.0, self._bias(true, intrinsics, view))
+        measured = measured + self.noise(true) * noise
         flying = edge & (chance >= settings.edge_dropout) & (chance < settings.edge_dropout + settings.flying_share)
         measured = np.where(flying, near + mixture * (far - near), measured)
         lost = (edge & (chance < settings.edge_dropout)) | (patches < _quantile_of(settings.hole_share))

@@ -1,0 +1,280 @@
+"""Which pixels lie on wide planes where depth is noisy: planes fitted to all views, thresholds from the noise found."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+_STEP = 3
+"""Pixels between the three depths that are compared to find noise: neighbours err alike, so nearer ones hide it."""
+
+_NORMAL_MAD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+_NUM_SAMPLED, _NUM_TRIALS, _MAX_PLANES = 3000, 400, 6
+_INLIER = 2.5
+"""Standard deviations within which a point supports a plane."""
+
+_MIN_SHARE = 0.03
+"""Share of all points that a plane must hold."""
+
+_NUM_BINS, _MIN_IN_BIN = 24, 20
+"""Distances in which bias and noise of a plane are found anew, and pixels that say so."""
+
+_MOVING_COST = 3.4
+"""Cost of saying that a pixel is on no plane, in nats: on its own it must be 2.6 standard deviations off."""
+
+_MAX_COST = 12.0
+_COUPLING = 1.2
+"""Cost of differing from one of eight neighbours, in nats."""
+
+_NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
+_ALIKE = 3.0
+"""Standard deviations that neighbours may differ by and pull at each other; a body and what is behind it do not."""
+
+_FAR = 1e9  # whose square is a number
+_MIN_ALIKE = 2
+_MAX_STEEPNESS = 4.0
+"""Neighbours of its own surface that a pixel of a body has; tangent to the rays up to which they are of its surface."""
+
+_NUM_ROUNDS = 8
+_MIN_PIXELS = 5
+_MIN_DEVIATIONS = 3.0
+"""Pixels of a body, and their median distance from the planes in standard deviations; less is a patch of noise."""
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Pixels of all views. A plane's inverse depth is that of its normal form, so that no point has to be moved."""
+
+    depth: Float[NDArray[np.float64], "view height width"]
+    rays: Float[NDArray[np.float64], "view height width 3"]  # world, one unit along the optical axis
+    centers: Float[NDArray[np.float64], "view 3"]
+    valid: Bool[NDArray[np.bool_], "view height width"]
+
+    @property
+    def points(self) -> Float[NDArray[np.float64], "view height width 3"]:
+        return self.centers[:, None, None] + self.rays * self.depth[..., None]
+
+    def residuals(self, plane: NDArray[np.float64]) -> Float[NDArray[np.float64], "view height width"]:
+        """Return by what share of its depth each pixel lies behind a plane (normal, height); infinite where none is."""
+        normal, height = plane[:3], plane[3]
+        nearness = (self.rays @ normal) / _not_zero(height - self.centers @ normal)[:, None, None]
+        with np.errstate(over="ignore"):
+            return np.where(self.valid & (nearness > 0), self.depth * nearness - 1, np.inf)
+
+
+def relative_noise(
+    depth: Float[np.ndarray, "view height width"], valid: Bool[np.ndarray, "view height width"]
+) -> Float[np.ndarray, " view"]:
+    """Return the median noise of each view as a share of depth; 0 where too little is seen.
+
+    The inverse depth of a plane is linear in the picture. The second differences of most pixels, which show surfaces
+    that hardly bend, are noise; the median does not see the others.
+    """
+    found = np.zeros(len(depth))
+    for view, (one, there) in enumerate(zip(depth, valid, strict=True)):
+        nearness = np.where(there, 1 / np.where(there, one, 1.0), np.nan)
+        parts = []
+        for lines in (nearness, nearness.T):
+            if lines.shape[0] > 2 * _STEP:
+                middle = lines[_STEP:-_STEP]
+                bend = (lines[2 * _STEP :] - 2 * middle + lines[: -2 * _STEP]) / middle
+                parts.append(bend[np.isfinite(bend)])
+        every = np.concatenate(parts) if parts else np.empty(0)
+        if every.size >= _MIN_IN_BIN:
+            found[view] = _NORMAL_MAD * np.median(np.abs(every)) / np.sqrt(6)
+    return found
+
+
+def off_wide_planes(
+    depth: Float[np.ndarray, "view height width"],
+    rays: Float[np.ndarray, "view height width 3"],
+    centers: Float[np.ndarray, "view 3"],
+    valid: Bool[np.ndarray, "view height width"],
+    noise: Float[np.ndarray, " view"],
+    pixel_sizes: Float[np.ndarray, " view"],
+    *,
+    min_width: float,
+) -> Bool[np.ndarray, "view height width"] | None:
+    """Return which valid pixels lie on no wide plane; None where no wide plane is found.
+
+    Planes are fitted by RANSAC to the points of all views together; one counts where it holds many points and reaches
+    ``min_width`` of the diagonal of all that is seen. For each plane, view and distance its bias and noise are found
+    anew: at grazing angles a sensor errs by more than it scatters. How many standard deviations a pixel lies off its
+    nearest plane, and what its neighbours say (mean field of a Potts model), decides. ``rays`` are one unit along the
+    optical axis, in the world; ``noise`` is a share of depth (``relative_noise``), and so is ``pixel_sizes``, what a
+    pixel covers.
+    """
+    views = _Views(depth.astype(np.float64), rays.astype(np.float64), centers.astype(np.float64), valid)
+    if valid.sum() < _MIN_IN_BIN:
+        return None
+    planes = _wide_planes(views, noise, min_width)
+    if not planes:
+        return None
+    judged = [_deviations(views, plane, noise) for plane in planes]
+    every = np.stack([deviations for deviations, _ in judged])
+    nearest = np.abs(every).argmin(axis=0)[None]
+    signed, scatters = (np.take_along_axis(np.stack(parts), nearest, axis=0)[0] for parts in zip(*judged, strict=True))
+    result = np.zeros_like(valid)
+    for view, there in enumerate(valid):
+        moving = _settled(signed[view], there)
+        reach = np.maximum(_ALIKE * np.sqrt(2) * scatters[view], _MAX_STEEPNESS * pixel_sizes[view])
+        with np.errstate(invalid="ignore"):
+            moving = _without_flying(moving, signed[view] * scatters[view], reach)
+        result[view] = _without_specks(moving, np.abs(signed[view]))
+    return result
+
+
+def _wide_planes(views: _Views, noise: NDArray[np.float64], min_width: float) -> list[NDArray[np.float64]]:
+    points, where = views.points[views.valid], np.nonzero(views.valid)[0]
+    depth, scatter = views.depth[views.valid], np.maximum(noise, noise[noise > 0].min(initial=1.0))
+    sigma = scatter[where] * depth  # metres along the ray
+    draw = np.random.default_rng(0)
+    chosen = draw.permutation(len(points))[:_NUM_SAMPLED]
+    whole = np.linalg.norm(np.ptp(points, axis=0))
+    rays = views.rays[views.valid]
+    free, planes = np.ones(len(points), bool), []
+    for _ in range(_MAX_PLANES):
+        pool = chosen[free[chosen]]
+        if len(pool) < max(_MIN_IN_BIN, _MIN_SHARE * len(chosen)):
+            break
+        plane = _ransac(points[pool], rays[pool], sigma[pool], draw)
+        inside = np.zeros(len(points), bool)
+        for _ in range(3):  # the fit of all that supports it
+            inside = free & (np.abs(_along(plane, points, rays)) < _INLIER * sigma)
+            if inside.sum() < _MIN_IN_BIN:
+                break
+            plane = _fit(points[inside], 1 / sigma[inside])
+        near = np.abs(_along(plane, points, rays)) < 2 * _INLIER * sigma
+        if inside.sum() < _MIN_SHARE * len(points):
+            break
+        held = points[inside]
+        low, high = np.percentile(held, [2, 98], axis=0)
+        if np.linalg.norm(high - low) >= min_width * whole:
+            planes.append(plane)
+        free &= ~near
+    return planes
+
+
+def _ransac(
+    points: NDArray[np.float64], rays: NDArray[np.float64], sigma: NDArray[np.float64], draw: np.random.Generator
+) -> NDArray[np.float64]:
+    corners = points[draw.integers(len(points), size=(_NUM_TRIALS, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    off = np.abs(points @ normals.T - (normals * corners[:, 0]).sum(1))
+    slope = np.abs(rays @ normals.T)
+    # Points on the surface of a body beside the plane must not count for it: a plane seen edge-on holds anything.
+    support = ((off < _INLIER * sigma[:, None] * slope) & (slope > 0.05)).sum(0)
+    best = int(support.argmax())
+    return np.append(normals[best], normals[best] @ corners[best, 0])
+
+
+def _along(plane: NDArray[np.float64], points: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return metres along the rays from the plane to the points."""
+    return (points @ plane[:3] - plane[3]) / _not_zero(rays @ plane[:3])
+
+
+def _fit(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    weights = weights**2 / (weights**2).sum()
+    middle = weights @ points
+    _, _, axes = np.linalg.svd((points - middle) * np.sqrt(weights)[:, None], full_matrices=False)
+    return np.append(axes[2], axes[2] @ middle)
+
+
+def _deviations(
+    views: _Views, plane: NDArray[np.float64], noise: NDArray[np.float64]
+) -> tuple[Float[NDArray[np.float64], "view height width"], Float[NDArray[np.float64], "view height width"]]:
+    """Return how many standard deviations pixels lie behind a plane, and what one is as a share of depth.
+
+    Bias and noise are those of view and distance.
+    """
+    residuals = views.residuals(plane)
+    result = np.full(residuals.shape, np.inf)
+    scatters = np.broadcast_to(noise[:, None, None], residuals.shape).copy()
+    for view, (residual, depth) in enumerate(zip(residuals, views.depth, strict=True)):
+        known = np.isfinite(residual)
+        if known.sum() < _MIN_IN_BIN or noise[view] == 0:
+            continue
+        biases, spreads, middles = _by_distance(residual[known], depth[known], noise[view])
+        bias, scatters[view] = np.interp(depth, middles, biases), np.interp(depth, middles, spreads)
+        result[view] = np.where(known, (residual - bias) / scatters[view], np.inf)
+    return result, scatters
+
+
+def _by_distance(
+    residual: NDArray[np.float64], depth: NDArray[np.float64], noise: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return bias, noise (shares of depth) and middles of bins of distance, from the surest one outwards."""
+    edges = np.quantile(depth, np.linspace(0, 1, _NUM_BINS + 1))
+    number = np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, _NUM_BINS - 1)
+    middles = (edges[:-1] + edges[1:]) / 2 + np.arange(_NUM_BINS) * 1e-12
+    biases, scatters = np.zeros(_NUM_BINS), np.full(_NUM_BINS, noise)
+    close = np.abs(residual) < _INLIER * noise
+    shares = [close[number == each].mean() if (number == each).any() else 0.0 for each in range(_NUM_BINS)]
+    start = int(np.argmax(shares))
+    for order in (range(start, _NUM_BINS), range(start - 1, -1, -1)):
+        for each in order:
+            beside = each + 1 if each < start else max(each - 1, start)
+            bias, scatter = biases[beside], scatters[beside]
+            mine = residual[number == each]
+            for _ in range(3):
+                inside = mine[np.abs(mine - bias) < 3 * scatter]
+                if len(inside) < _MIN_IN_BIN:
+                    break
+                bias = float(np.median(inside))
+                spread = _NORMAL_MAD * float(np.median(np.abs(inside - bias)))
+                scatter = float(np.clip(spread, 0.5 * noise, 3 * noise))
+            biases[each], scatters[each] = bias, scatter
+    return biases, scatters, middles
+
+
+def _settled(deviations: NDArray[np.float64], valid: NDArray[np.bool_]) -> Bool[NDArray[np.bool_], "height width"]:
+    """Return the pixels that are rather on no plane, given what their neighbours at a like distance are."""
+    gain = np.where(valid, np.minimum(deviations**2 / 2, _MAX_COST) - _MOVING_COST, 0.0)
+    pulls = [(shift, _COUPLING * np.exp(-(_apart(deviations, shift) ** 2) / (2 * _ALIKE**2))) for shift in _NEIGHBOURS]
+    state = np.where(valid, np.tanh(gain / 2), 0.0)
+    for _ in range(_NUM_ROUNDS):
+        around = sum(pull * _shifted(state, shift, 0.0) for shift, pull in pulls)
+        state = np.where(valid, np.tanh((gain + around) / 2), 0.0)
+    return valid & (state > 0)
+
+
+def _without_flying(
+    moving: NDArray[np.bool_], residuals: NDArray[np.float64], reach: NDArray[np.float64]
+) -> Bool[NDArray[np.bool_], "height width"]:
+    """Return moving pixels without those that hang alone between near and far.
+
+    ``reach`` says how far apart neighbours on one surface may be, as a share of their depth.
+    """
+    alike = sum((_apart(residuals, each) < reach) & _shifted(moving, each, False) for each in _NEIGHBOURS)
+    return moving & (np.asarray(alike) >= _MIN_ALIKE)
+
+
+def _shifted(values: NDArray[Any], shift: tuple[int, int], outside: float) -> NDArray[Any]:
+    """Return each pixel's neighbour."""
+    rows, columns = shift
+    height, width = values.shape
+    return np.pad(values, 1, constant_values=outside)[1 + rows : 1 + rows + height, 1 + columns : 1 + columns + width]
+
+
+def _apart(values: NDArray[np.float64], shift: tuple[int, int]) -> NDArray[np.float64]:
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(np.abs(values - _shifted(values, shift, np.inf)), nan=_FAR, posinf=_FAR)
+
+
+def _without_specks(moving: NDArray[np.bool_], deviations: NDArray[np.float64]) -> Bool[NDArray[np.bool_], "h w"]:
+    names, count = label(moving, structure=np.ones((3, 3)))
+    kept = np.zeros(count + 1, bool)
+    for name in range(1, count + 1):
+        mine = deviations[names == name]
+        kept[name] = len(mine) >= _MIN_PIXELS and np.median(mine) >= _MIN_DEVIATIONS
+    return kept[names]
+
+
+def _not_zero(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(np.abs(values) < 1e-12, 1e-12, values)
