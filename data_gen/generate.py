@@ -94,9 +94,7 @@ def generate(
         raise ConfigError(f"workers is {workers}; at least 1 is needed.")
     if not 0 <= seed < 2**63:
         raise ConfigError(f"seed is {seed}; allowed: 0 to 2^63 - 1.")
-    errors = {key: changes.pop(key) for key in list(changes) if key.startswith("sensor.")}
-    chosen = load_sensor(sensor, {key.removeprefix("sensor."): value for key, value in errors.items()})
-    plan = make_plan(scene, preset, Path(out).expanduser().absolute(), seed, changes, chosen)
+    plan = make_plan(scene, preset, Path(out).expanduser().absolute(), seed, changes, sensor)
     folder, files = plan.folder, plan.files()
     if folder.is_complete():
         print(f"{plan.out} is complete already.")
@@ -146,15 +144,19 @@ def _speed(plan: Plan, made: Sequence[worker.MadeFile], elapsed: float, num_work
 
 
 def make_plan(
-    scene: str, preset: str, out: Path, seed: int, overrides: Mapping[str, Any], sensor: SensorSettings | None = None
+    scene: str, preset: str, out: Path, seed: int, overrides: Mapping[str, Any], sensor: str = NO_SENSOR
 ) -> Plan:
-    """Check all settings and return what would be made."""
+    """Check all settings and return what would be made; ``overrides`` may hold settings of the sensor, too."""
+    prefix = "sensor."
+    changes = {key.removeprefix(prefix): value for key, value in overrides.items() if key.startswith(prefix)}
+    overrides = {key: value for key, value in overrides.items() if not key.startswith(prefix)}
+    errors = load_sensor(sensor, changes)
     family, _ = load_preset(scene, preset)
     module = import_module(f"data_gen.{family}")
     settings = load_settings(module.Settings, scene, preset, overrides)
-    if sensor is not None:
-        rendered_settings(settings, sensor)  # fails here once rather than in each worker
-    return Plan(scene, family, preset, seed, out, settings, module.VERSION, sensor)
+    if errors is not None:
+        rendered_settings(settings, errors)  # fails here once rather than in each worker
+    return Plan(scene, family, preset, seed, out, settings, module.VERSION, errors)
 
 
 def _make(

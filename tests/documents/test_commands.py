@@ -165,7 +165,7 @@ def test_a_command_can_be_composed(text: str) -> None:
         seed, _ = settings.pop("seed", 0), settings.pop("workers", None)
         if "objects.mesh_folder" in settings:  # whose meshes are read at once
             settings.pop("objects.mesh_folder")
-        make_plan(places[0], places[1], Path(places[2]), seed, settings)
+        make_plan(places[0], places[1], Path(places[2]), seed, settings, settings.pop("sensor", "none"))
     elif command in ("eval", "render", "view", "bench", "export"):
         compose(command, [re.sub(r"^(suite=\w+),.*", r"\1", word) for word in words])  # one of several suites
 
