@@ -212,7 +212,7 @@ def _made(scene: str, preset: str, out: Path, options: Options) -> _Made | None:
     path = out / "train" / "000000.h5"
     path.parent.mkdir(parents=True)
     jobs = {path: (0, "train", 0, path, "")}  # nobody asks these files what they were made from
-    made = run_jobs(jobs, (plan.family, plan.settings, backend), worker.environment(backend), 1, lambda: None)
+    made = run_jobs(jobs, (plan.family, plan.settings, backend, None), worker.environment(backend), 1, lambda: None)
     camera, splits = plan.settings.camera, plan.settings.splits
     return _Made(
         seconds=made[path].seconds,

@@ -100,7 +100,7 @@ def _make(
     seed = plan.settings.seed
     job = ImportJob(plan.source, replace(plan.settings, format=plan.format), (plan.frame, plan.bounds))
     jobs = {path: (seed, clip.split, int(path.stem), path, scene_hash) for path, clip in missing.items()}
-    made = run_jobs(jobs, ("importers.clip_scene", job, ""), environment(""), num_workers, advance)
+    made = run_jobs(jobs, ("importers.clip_scene", job, "", None), environment(""), num_workers, advance)
     return {path: file.sha256 for path, file in made.items()}
 
 
