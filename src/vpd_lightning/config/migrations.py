@@ -58,7 +58,6 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "shadow_softness": 0.5,
     },
     "vpd_lightning.data.datamodule.VideoDataModule": {"sensor": "none", "sensor_percent": None},
-    "vpd_lightning.data.views.view_datamodule.ViewDataModule": {"sensor": "none", "sensor_percent": None},
     "vpd_lightning.encoder.particles.wide_surface_background.WideSurfaceBackground": {"noise_floor": 0.001},
     "vpd_lightning.encoder.unet.UNetEncoder": {"color_features": False, "same_pixels": False, "has_scenery": False},
 }

@@ -40,7 +40,8 @@ class ViewDataModule(VideoDataModule):
         **video: Any,
     ) -> None:
         """Check the numbers; files are first touched by ``setup``."""
-        super().__init__(**{**video, "cache": False})  # not the full images
+        older = {"sensor": "none", "sensor_percent": None}  # what configurations from before these settings mean
+        super().__init__(**{**older, **video, "cache": False})  # not the full images
         if num_history < 1 or frame_offset < 1 or resolution < 1:
             raise ValueError(
                 "resolution, num_history and frame_offset must be at least 1, got"
