@@ -84,8 +84,9 @@ PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 PARALLEL = -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 # What has a target of its own: markers, and where the tests that have them lie.
 PARTS = data or site or package or launcher or browser or documents or kernels or benchmarks or reliability
-PARTS_IN = tests/data_gen tests/integration tests/commands/test_launchers.py tests/viewer tests/test_site.py tests/test_packaging.py \
-	tests/documents tests/examples tests/stability/test_interpreter_stability.py tests/renderer tests/graph tests/benchmarks tests/reliability
+# The interpreter's matrix comes first: it takes longest, and no process should be left alone with it at the end.
+PARTS_IN = tests/stability/test_interpreter_stability.py tests/data_gen tests/integration tests/commands/test_launchers.py tests/viewer \
+	tests/test_site.py tests/test_packaging.py tests/documents tests/examples tests/renderer tests/graph tests/benchmarks tests/reliability
 
 test: $(STAMP) ## Run the tests, but for the parts below; of the stability matrix a part that covers it (no GPU, no torch-cluster)
 	$(PYTEST) $(PARALLEL) -m "not exhaustive and not ($(PARTS))" --durations=15 --durations-min=5 $(PYTEST_ARGS)

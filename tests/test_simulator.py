@@ -3,6 +3,7 @@
 import itertools
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -199,6 +200,29 @@ def test_the_python_face_encodes_rolls_out_and_renders():
     assert maps.depths.shape == (2, 2, 8, 8) and maps.opacities.shape == (2, 2, 8, 8)
     assert torch.equal(frames, model.render(model.rollout(model.encode(
         data.context.rgb[0].float() / 255, data.context.depth[0].double(), cameras), 2), cameras))  # fmt: skip
+
+
+def test_numpy_arrays_are_encoded_as_tensors_are():
+    model, context, cameras = simulator(Drift()), batch().context, looking_down()
+    matrices = [part.double().numpy() for part in (cameras.intrinsics, cameras.cam_to_world)]
+
+    found = model.encode(
+        context.rgb[0].numpy(),
+        context.depth[0].double().numpy(),
+        Cameras.from_arrays(*matrices, cameras.height, cameras.width),
+    )
+
+    expected = model.encode(context.rgb[0], context.depth[0], cameras)
+    assert torch.equal(found.current.positions, expected.current.positions)
+    assert torch.equal(found.current.features, expected.current.features)
+
+
+def test_matrices_of_the_wrong_shape_and_depth_in_millimetres_are_refused():
+    with pytest.raises(ValueError, match=r"cam_to_world \(view, 4, 4\), got"):
+        Cameras.from_arrays(np.eye(3)[None], np.eye(4), 8, 8)
+    context = batch().context
+    with pytest.raises(ValueError, match="metres"):
+        simulator().encode(context.rgb[0], (context.depth[0] * 1000).short(), looking_down())
 
 
 def test_frames_of_the_wrong_shape_are_refused():

@@ -49,7 +49,7 @@ def open_format(path: Path, wanted: str) -> tuple[str, ImportFormat]:
         )
     if wanted != AUTO:
         return wanted, _module(wanted)
-    found = [name for name in FORMATS if _module(name).matches(path)]
+    found = matching_formats(path)
     if not found:
         raise DataError(
             f"{path} is none of the formats that can be imported: {', '.join(FORMATS)}.\n"
@@ -58,6 +58,11 @@ def open_format(path: Path, wanted: str) -> tuple[str, ImportFormat]:
     if len(found) > 1:
         raise ConfigError(f"{path} looks like {' and '.join(found)}. Say which: format={found[0]}")
     return found[0], _module(found[0])
+
+
+def matching_formats(path: Path) -> list[str]:
+    """Return the names of the formats that a path looks like."""
+    return [name for name in FORMATS if _module(name).matches(path)]
 
 
 def _module(name: str) -> ImportFormat:

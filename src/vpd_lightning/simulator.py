@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -200,14 +201,19 @@ class Simulator(AbstractSystem):
     # The Python interface to a trained model.
 
     @torch.no_grad()
-    def encode(self, rgb: Tensor, depth: Tensor, cameras: Cameras, keys: RandomKeys | None = None) -> Scene:
-        """Encode two frames: ``rgb`` (2, view, height, width, 3) uint8 or [0, 1], ``depth`` in metres.
+    def encode(
+        self, rgb: Tensor | np.ndarray, depth: Tensor | np.ndarray, cameras: Cameras, keys: RandomKeys | None = None
+    ) -> Scene:
+        """Encode two frames: ``rgb`` (2, view, height, width, 3) uint8 or [0, 1], ``depth`` in metres, floating point.
 
-        ``cameras`` has axes ``view`` or ``2 view``. The draws (particle subsample) are the same every time, unless
-        ``keys`` (for a batch of one) says otherwise. The current particles come with what the dynamics guesses of their
-        hidden side.
+        Images are tensors or NumPy arrays (``Cameras.from_arrays`` makes cameras of arrays). ``cameras`` has axes
+        ``view`` or ``2 view``. The draws (particle subsample) are the same every time, unless ``keys`` (for a batch of
+        one) says otherwise. The current particles come with what the dynamics guesses of their hidden side.
         """
         self.eval()
+        rgb, depth = torch.as_tensor(rgb), torch.as_tensor(depth)
+        if not depth.is_floating_point():
+            raise ValueError(f"depth must be in metres, as floating point, got {depth.dtype}")
         if rgb.shape[:1] != (2,) or rgb.shape[:-1] != depth.shape:
             raise ValueError(
                 f"rgb must be (2, view, height, width, 3) and depth (2, view, height, width); "

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, UInt8
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from vpd_lightning.errors import NonFiniteError
@@ -56,6 +57,21 @@ class Cameras(_Border):
     cam_to_world: Float[Tensor, "*shape 4 4"]
     height: int
     width: int
+
+    @classmethod
+    def from_arrays(cls, intrinsics: ArrayLike, cam_to_world: ArrayLike, height: int, width: int) -> "Cameras":
+        """Return cameras of NumPy arrays, nested lists or tensors, as float32.
+
+        Raises:
+            ValueError: shapes other than (..., 3, 3) and (..., 4, 4), or leading axes that differ.
+        """
+        matrices = [torch.as_tensor(part, dtype=torch.float32) for part in (intrinsics, cam_to_world)]
+        shapes = [tuple(part.shape) for part in matrices]
+        if shapes[0][-2:] != (3, 3) or shapes[1][-2:] != (4, 4) or shapes[0][:-2] != shapes[1][:-2]:
+            raise ValueError(
+                f"intrinsics must be (view, 3, 3) and cam_to_world (view, 4, 4), got {shapes[0]} and {shapes[1]}"
+            )
+        return cls(matrices[0], matrices[1], height, width)
 
     def __getitem__(self, index: Any) -> "Cameras":
         return Cameras(self.intrinsics[index], self.cam_to_world[index], self.height, self.width)

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import h5py
 import pytest
@@ -29,6 +30,8 @@ BAD_CONFIGURATIONS = {
     "forced key": (["++seed=1"], "behind the schema's back"),
     "removed key": (["~scene"], "behind the schema's back"),
     "no equal sign": (["seed"], "cannot read 'seed'"),
+    "folder without a key": (["datasets/mine"], "Did you mean data.folder=datasets/mine?"),
+    "folder for an option": (["data=datasets/mine"], "Write data.folder=datasets/mine"),
     "several values without -m": (["seed=1,2"], "For a sweep add -m"),
     "unknown flag": (["--fast"], "there is no flag --fast"),
     "other configuration folder": (["--config-path=/tmp"], "--config-path is not supported"),
@@ -66,6 +69,11 @@ def test_bad_configuration(case: str, quick: list[str], in_folder: Path, fails: 
     message = fails(train.main, [*words, *quick] if words[0].startswith("-") else [*quick, *words], 2)
 
     assert said in message
+
+
+@pytest.mark.parametrize("command", [eval, render], ids=["eval", "render"])
+def test_checkpoint_without_a_key(command: ModuleType, in_folder: Path, fails: Fails):
+    assert "Did you mean ckpt=runs/mine?" in fails(command.main, ["runs/mine"], 2)
 
 
 def copy_of(dataset: Path, folder: Path) -> Path:

@@ -48,6 +48,12 @@ class Mistake:
     before: Callable[[pytest.MonkeyPatch], object] = field(default=lambda patch: None)
 
 
+def _recording(patch: pytest.MonkeyPatch) -> None:
+    Path("kitchen").mkdir(exist_ok=True)
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        (Path("kitchen") / name).touch()
+
+
 def _occupied(patch: pytest.MonkeyPatch) -> None:
     Path("runs/mine").mkdir(parents=True)
     (Path("runs/mine") / run_claim.CLAIM).touch()
@@ -133,6 +139,8 @@ MISTAKES = [
     Mistake("A sweep over runs with several devices", "vpd-train -m experiment=tiny seed=1,2 trainer.devices=2", 2),
     Mistake("Data that were not generated yet", "vpd-train experiment=mujoco_block trainer=cpu", 3),
     Mistake("A data folder that is not there", "vpd-train data.folder=mine trainer=cpu", 3),
+    Mistake("A folder where an option belongs", "vpd-train experiment=tiny data=datasets/mine", 2),
+    Mistake("A folder without a key", "vpd-train experiment=tiny datasets/mine", 2),
     Mistake("A data file that was cut short", "vpd-train data.folder=datasets/cut", 3, QUICK, _cut_data),
     Mistake(
         "A data folder that is spelt wrong", "vpd-train experiment=tiny data.folder=datasets/tinny", 3, QUICK,
@@ -156,6 +164,7 @@ MISTAKES = [
     Mistake("Nothing to resume", "vpd-train resume=last", 4),
     Mistake("resume=auto without a folder", "vpd-train experiment=tiny resume=auto", 2),
     Mistake("No checkpoint given", "vpd-eval", 2),
+    Mistake("A checkpoint without a key", "vpd-eval runs/mine", 2),
     Mistake("A checkpoint that is not there", "vpd-eval ckpt=nowhere.ckpt", 4),
     Mistake("A checkpoint that was cut short", "vpd-eval ckpt=cut.ckpt", 4, "", _damaged),
     Mistake("A checkpoint that is damaged", "vpd-eval ckpt=damaged.ckpt", 4, "", _damaged),
@@ -171,6 +180,7 @@ MISTAKES = [
     Mistake("No GL", "vpd-data generate scene=mujoco_block preset=tiny out=made renderer=auto", 3, "", _no_gl),
     Mistake("A preset that does not exist", "vpd-data generate scene=mujoco_block preset=tinny out=made", 2),
     Mistake("A recording of no known kind", "vpd-data import runs out=made", 3),
+    Mistake("A recording that was not imported", "vpd-data inspect kitchen", 3, before=_recording),
     Mistake("A model that was not evaluated", "vpd-export ckpt=runs/trained out=released/mine", 2),
     Mistake("A report about nothing", "vpd-report runs", 3),
     Mistake("A port that something listens on", "vpd-view ckpt=runs/trained port=8765", 2, before=_taken_port),

@@ -67,6 +67,7 @@ def test_validate_lists_faults_and_fails(tmp_path: Path, capsys: pytest.CaptureF
         (["inspect", "{folder}", "size=3"], 2, "inspect has no setting 'size'"),
         (["inspect", "{folder}"], 3, "No data set in"),
         (["validate", "{out}"], 3, "Make one: vpd-data generate"),
+        (["validate", "{out}"], 3, "vpd-data import from a recording"),
         (["validate", "{file}"], 3, "not an HDF5 file"),
         (["validate", "{folder}"], 3, "fault"),
     ],
@@ -86,6 +87,27 @@ def test_wrong_use_gets_a_short_message_and_its_exit_code(
     assert "Traceback" not in printed.err
     assert len(printed.err.splitlines()) <= 5
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("verb", ["inspect", "validate", "split"])
+def test_a_recording_that_was_not_imported_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: str):
+    folder = tmp_path / "table"
+    folder.mkdir()
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        (folder / name).touch()
+
+    assert main([verb, str(folder)]) == 3
+
+    said = capsys.readouterr().err
+    assert "is a recording (tum)" in said and f"vpd-data import {folder} out=datasets/table" in said
+
+
+def test_a_mistyped_data_set_is_suggested(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "blocks").mkdir()
+    (tmp_path / "blocks" / "dataset.json").touch()
+
+    assert main(["inspect", str(tmp_path / "bloks")]) == 3
+    assert f"Did you mean {tmp_path / 'blocks'}?" in capsys.readouterr().err
 
 
 def test_help_loads_nothing_heavy():  # tests/test_architecture.py counts what it does

@@ -46,8 +46,15 @@ def test_section_becomes_an_object():
     ],
 )
 def test_class_from_elsewhere_is_refused_before_anything_runs(target: Any):
-    with pytest.raises(ConfigError, match="may not be built|does not exist"):
+    with pytest.raises(ConfigError, match="may not be built|does not exist|is not installed"):
         build({"_target_": target}, None, "loss.pixel")
+
+
+def test_a_plug_in_that_is_not_installed_is_named():
+    with pytest.raises(
+        ConfigError, match="needs the plug-in their_lab, which is not installed here.\npip install their_lab"
+    ):
+        build({"_target_": "their_lab.dynamics.DriftDynamics"}, None, "dynamics")
 
 
 @pytest.mark.parametrize("target", ["torch.optim.Adam", "lightning.pytorch.callbacks.ModelCheckpoint"])

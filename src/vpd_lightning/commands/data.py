@@ -142,8 +142,30 @@ def _one_place(verb: str, places: Sequence[str]) -> Path:
         raise ConfigError(f"{verb} takes one folder or .h5 file: vpd-data {verb} datasets/mujoco_block_demo")
     path = Path(places[0]).expanduser()
     if not path.exists():
-        raise DataError(f"There is no {path}.\nMake one: vpd-data generate; vpd-data --help says how.")
+        from vpd_lightning.data.manifest import did_you_mean
+
+        raise DataError(
+            f"There is no {path}.{did_you_mean(path)}\n"
+            "Make one: vpd-data generate, or vpd-data import from a recording; vpd-data --help says how."
+        )
+    _refuse_recording(path)
     return path
+
+
+def _refuse_recording(path: Path) -> None:
+    """Say of a folder that is no data set, but that could become one, how it does."""
+    from vpd_lightning.data.manifest import FILE_NAME, UNFINISHED_NAME
+
+    if not path.is_dir() or any((path / name).is_file() for name in (FILE_NAME, UNFINISHED_NAME)):
+        return
+    from data_gen.importers.formats import matching_formats
+
+    found = matching_formats(path)
+    if found:
+        raise DataError(
+            f"{path} is a recording ({' or '.join(found)}) and not a data set yet.\n"
+            f"Import it first: vpd-data import {path} out=datasets/{path.resolve().name}"
+        )
 
 
 def _only(verb: str, settings: dict[str, Any], known: Sequence[str]) -> None:

@@ -6,6 +6,7 @@ import typing
 from collections.abc import Mapping, Sequence, Set
 from difflib import get_close_matches
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 
 from hydra.errors import InstantiationException
@@ -199,11 +200,22 @@ def resolve_class(target: Any, name: str, packages: Sequence[str]) -> type:
         "Another package joins through the entry-point group vpd_lightning.plugins."
     )
     if not isinstance(target, str) or not _is_below(target, allowed):
-        raise refusal
+        raise _missing_plugin(target, name) or refusal
     found = _locate(target, name)
     if not isinstance(found, type) or not _is_below(f"{found.__module__}.", allowed):
         raise refusal
     return found
+
+
+def _missing_plugin(target: Any, name: str) -> ConfigError | None:
+    """Return the error for a class of a package that is not installed; nothing is imported."""
+    package = target.partition(".")[0] if isinstance(target, str) else ""
+    if "." not in str(target) or not package.isidentifier() or find_spec(package) is not None:
+        return None
+    return ConfigError(
+        f"{name}._target_={target} needs the plug-in {package}, which is not installed here.\n"
+        f"pip install {package}, or the distribution that holds it (from its source: pip install -e FOLDER)."
+    )
 
 
 def _locate(target: str, name: str) -> Any:

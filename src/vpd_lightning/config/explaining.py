@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterator, Sequence
 from difflib import SequenceMatcher, get_close_matches
+from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -48,10 +49,12 @@ def explain(
     if isinstance(error, ConfigError):
         return error
     if isinstance(error, OverrideParseException):
-        return ConfigError(
-            f"cannot read '{error.override}'.\n{_first_line(text, skip='Error parsing')}\n"
+        word = str(error.override)
+        reason = _for_a_bare_path(word, command) or (
+            f"{_first_line(text, skip='Error parsing')}\n"
             f"Write key=value or group=option, without spaces around '=', for example: vpd-{command} seed=1"
         )
+        return ConfigError(f"cannot read '{word}'.\n{reason}")
     if isinstance(error, MissingConfigException):
         return _explain_missing_option(error.missing_cfg_file, error.options, overrides)
     unknown = re.search(r"Could not override '([^']+)'", text)  # the exception has no field for it
@@ -101,7 +104,20 @@ def keys_of(config: Any, prefix: str = "") -> Iterator[str]:
             yield from keys_of(value, f"{prefix}{name}.")
 
 
+def _for_a_bare_path(word: str, command: str) -> str:
+    """Return the setting that a path without a key was meant for, or an empty string."""
+    if "=" in word or not ("/" in word or Path(word).exists()):
+        return ""
+    key = "data.folder" if command == "train" else "ckpt"
+    return f"A setting has a name. Did you mean {key}={word}?"
+
+
 def _explain_missing_option(path: str | None, options: Sequence[str] | None, overrides: Sequence[str]) -> ConfigError:
+    folder = next((word.removeprefix("data=") for word in overrides if word.startswith("data=")), "")
+    if (path or "").startswith("data/") and ("/" in folder or Path(folder).is_dir()):
+        return ConfigError(
+            f"data={folder} names a folder, and data an option of conf/data.\nWrite data.folder={folder}"
+        )
     group, _, option = (path or "").rpartition("/")
     guess = suggest(option, options or ())
     if not options:

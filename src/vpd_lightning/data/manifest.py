@@ -233,7 +233,7 @@ def _missing(folder: Path) -> str:
     return (
         f"No data set in {folder} (there is no {FILE_NAME}).{did_you_mean(folder)}\n"
         f"Make it:  vpd-data generate {command} out={folder}{hint}\n"
-        "or point data.folder at one that exists."
+        "or point data.folder at one that exists. A recording must be imported first: vpd-data import SOURCE out=FOLDER"
     )
 
 
