@@ -5,18 +5,21 @@ space of another contradicts it: a wrong pose or depth, or a pixel that mixes tw
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.inspection.posed_depth import ImageKey, PosedDepth, choose_pairs, read_posed_depth
+from data_gen.inspection.smooth_surface import smooth_surface
 from vpd_lightning.data.reader import TrajectoryReader
 
 MAX_SHARE = 0.01
 TOLERANCE = 0.005  # of the workspace's longest side
 _NOISE_FACTOR = 4.0  # standard deviations of the depth noise that a point may lie in front as well
+_NOISE_STEP = 3  # pixels
+_MEASURED_NOISE = 0.0005  # share of depth from which on it is that of a sensor
 _MAX_PAIRS = 36
 _MAX_FRAMES = 3
 
@@ -54,8 +57,13 @@ def free_space_violations(
             pairs += choose_pairs(reader, max(1, max_pairs // len(times)), [time])
         images = read_posed_depth(reader, [key for pair in pairs for key in pair])
         tolerance = TOLERANCE * float(np.max(np.subtract(reader.workspace_max, reader.workspace_min)))
-    minima = {key: _nearest_of_nine(image.depth) for key, image in images.items()}
     noise = float(np.median([depth_noise(image) for image in images.values()])) if images else 0.0
+    if noise > _MEASURED_NOISE:
+        images = {
+            key: replace(image, depth=np.where(smooth_surface(image).is_sure, image.depth, 0))
+            for key, image in images.items()
+        }
+    minima = {key: _nearest_of_nine(image.depth) for key, image in images.items()}
     counts: dict[tuple[int, int], NDArray[np.int64]] = {}
     for first, second in pairs:
         here = _count(images[first], images[second], minima[second], tolerance, noise)
@@ -75,16 +83,18 @@ def free_space_violations(
 def depth_noise(image: PosedDepth) -> float:
     """Estimate the noise of an image: one standard deviation over depth, from second differences of inverse depth.
 
-    Planes have none; what a minority of curved or broken places has does not move the median.
+    Planes have none; what a minority of curved or broken places has does not move the median. The differences are taken
+    over ``_NOISE_STEP`` pixels: neighbours err alike, which would hide the noise.
     """
-    valid = image.depth > 0
+    valid, step = image.depth > 0, _NOISE_STEP
     inverse = np.divide(1.0, image.depth, out=np.zeros(image.depth.shape), where=valid)
-    bends = np.abs(inverse[:, 2:] - 2 * inverse[:, 1:-1] + inverse[:, :-2])
-    is_whole = valid[:, 2:] & valid[:, 1:-1] & valid[:, :-2]
+    middle = inverse[:, step:-step]
+    bends = np.abs(inverse[:, 2 * step :] - 2 * middle + inverse[:, : -2 * step])
+    is_whole = valid[:, 2 * step :] & valid[:, step:-step] & valid[:, : -2 * step]
     if not is_whole.any():
         return 0.0
     # 1.4826 turns the median of absolute values into a standard deviation; 1, -2, 1 has the norm sqrt(6).
-    return float(1.4826 / np.sqrt(6) * np.median(bends[is_whole] / inverse[:, 1:-1][is_whole]))
+    return float(1.4826 / np.sqrt(6) * np.median(bends[is_whole] / middle[is_whole]))
 
 
 def _count(
@@ -100,8 +110,13 @@ def _count(
     depth = seen[is_inside, 2]
     limit = nearest[row[is_inside].astype(np.int64), column[is_inside].astype(np.int64)].astype(np.float64)
     is_known = limit > 0
-    excess = (limit - depth - tolerance)[is_known]
-    return np.array([is_known.sum(), (excess > 0).sum(), (excess > _NOISE_FACTOR * noise * depth[is_known]).sum()])
+    limit, depth = limit[is_known], depth[is_known]
+    excess = limit - depth - tolerance
+    if not len(limit):
+        return np.zeros(3, np.int64)
+    # Noise in metres grows with the square of the distance; ``noise`` is that at the middle one.
+    scatter = noise * depth * np.maximum(1.0, depth / np.median(depth))
+    return np.array([len(limit), (excess > 0).sum(), (excess > _NOISE_FACTOR * scatter).sum()])
 
 
 def _nearest_of_nine(depth: NDArray[np.float32]) -> NDArray[np.float32]:

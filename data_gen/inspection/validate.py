@@ -4,6 +4,7 @@ What cannot be right is a fault; what a person should know, such as that the vie
 a remark. See ``view_agreement`` and ``free_space`` for what is compared between views.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from data_gen.inspection.camera_conventions import STORED, CameraConvention, single_mistakes
 from data_gen.inspection.fault import Fault
 from data_gen.inspection.free_space import MAX_SHARE, FreeSpace, free_space_violations
+from data_gen.inspection.pose_agreement import MAX_MISPLACED, Misplacement, misplacements, outlier_view
 from data_gen.inspection.posed_depth import PosedDepth
 from data_gen.inspection.view_agreement import MAX_PAIRS, Agreement, compare_views
 from vpd_lightning.data import schema
@@ -146,10 +148,13 @@ def _is_comparable(faults: list[Fault]) -> bool:
 def _check_views(path: Path, max_pairs: int = MAX_PAIRS) -> _Views:
     with TrajectoryReader(path) as reader:
         agreement = compare_views(reader, max_pairs)
+        poses = misplacements(reader, max_pairs)
     free_space = free_space_violations(path)
     faults = [Fault("cannot_tell", str(path), _STATIC_VIEW, is_error=False)]
     if agreement is not None:
         faults = _judge(path, agreement)
+    if not any(fault.is_error for fault in faults):
+        faults += _judge_poses(path, poses)
     if not any(fault.is_error for fault in faults) and free_space.share > MAX_SHARE:
         faults.append(_judge_free_space(path, free_space))
     return _Views(faults, agreement, free_space)
@@ -196,6 +201,21 @@ def _judge(path: Path, agreement: Agreement) -> list[Fault]:
         message = f"{reason} whether: {listed}"
         return [Fault("cannot_tell", str(path), message, is_error=False)]
     return []
+
+
+def _judge_poses(path: Path, found: Sequence[Misplacement]) -> list[Fault]:
+    worst = outlier_view(found)
+    if worst is None:
+        return []
+    view, pair = worst
+    other = pair.views[0] if pair.views[1] == view else pair.views[1]
+    message = (
+        f"the pose of view {view} is off: its surfaces lie {100 * pair.distance:.2g} cm (standard error "
+        f"{100 * pair.error:.1g} cm) from those of view {other}, {_percent(pair.distance / pair.depth)} of their "
+        f"depth; allowed {_percent(MAX_MISPLACED)}. Calibrate it again (pose, principal point), or trigger the cameras "
+        "together"
+    )
+    return [Fault("pose_off", str(path), message)]
 
 
 def _judge_free_space(path: Path, free_space: FreeSpace) -> Fault:

@@ -1,0 +1,147 @@
+"""Whether cameras of one moment stand where their poses say, told from surfaces that two of them see.
+
+Noise hides a wrong pose from single points, and not from all of them together: the points of one view are moved
+rigidly onto the surfaces that another view sees there (point to plane, Chen and Medioni 1992, one linear step), and how
+far they are moved is compared with how surely it is known. What the surfaces do not determine, as sliding along a bare
+floor, counts as right.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_gen.inspection.posed_depth import Array, PosedDepth, choose_pairs, rays, read_posed_depth
+from data_gen.inspection.smooth_surface import SmoothSurface, smooth_surface
+from vpd_lightning.data.reader import TrajectoryReader
+
+MAX_MISPLACED = 0.005
+"""Share of the depth by which a pose may move surfaces: 1 cm at 2 m. Good calibrations leave a quarter of it."""
+
+_SURE = 4.0  # standard errors beyond that share
+_MIN_POINTS = 100
+_MAX_TIMES = 5
+_SPACING = 3  # pixels between points: nearer ones err alike
+_REACH = 0.1  # of the depth: farther apart are other surfaces
+_NUM_ROUNDS, _INLIER = 4, 3.0  # fits, and standard deviations within which points count
+_KEPT = 0.015  # of the depth: so far off points always count, or a bare floor would outvote all that stands on it
+_TELLING = 20.0  # points that face a motion, or as many more that it passes at an angle; fewer say nothing of it
+
+
+@dataclass(frozen=True)
+class Misplacement:
+    """The rigid motion that brings one view's surfaces onto another's: its surest part, a shift or a turn.
+
+    ``distance`` is metres, of a turn at the mean distance from the points' centre; ``error`` is its standard error,
+    ``depth`` the median depth of the points, all in metres.
+    """
+
+    views: tuple[int, int]
+    distance: float
+    error: float
+    depth: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is surely more than a calibration leaves."""
+        return self.distance > MAX_MISPLACED * self.depth + _SURE * self.error
+
+
+def misplacements(reader: TrajectoryReader, max_pairs: int) -> list[Misplacement]:
+    """Compare views of one moment, pair by pair; pairs that share too few surfaces are left out.
+
+    Cameras that stand still are compared at several moments together: what moves shows its sides at different places.
+    """
+    middle = reader.num_frames // 2
+    times = [middle]
+    if reader.is_static_cameras:
+        times = np.unique(np.linspace(0, reader.num_frames - 1, _MAX_TIMES).round().astype(int)).tolist()
+    pairs = [(one[1], two[1]) for one, two in choose_pairs(reader, max_pairs, [middle]) if one[0] == two[0]]
+    images = read_posed_depth(reader, [(time, view) for time in times for pair in pairs for view in pair])
+    surfaces = {key: smooth_surface(image) for key, image in images.items()}
+    found = []
+    for first, second in pairs:
+        parts = [
+            _residuals(images[time, first], surfaces[time, first], images[time, second], surfaces[time, second])
+            for time in times
+        ]
+        found.append(_misplacement((first, second), *(np.concatenate(part) for part in zip(*parts, strict=True))))
+    return [item for item in found if item is not None]
+
+
+def outlier_view(found: Sequence[Misplacement]) -> tuple[int, Misplacement] | None:
+    """Return the view whose pairs are farthest off, with its worst pair; None where no pair is certain.
+
+    A pair counts where it is certain either way around: from its first view's points, and from its second's.
+    """
+    either = {item.views: item for item in found}
+    certain = [item for item in found if item.is_certain and either.get(item.views[::-1], item).is_certain]
+    if not certain:
+        return None
+    off = {view: [item.distance for item in found if view in item.views] for item in certain for view in item.views}
+    worst = max(off, key=lambda view: float(np.median(off[view])))
+    return worst, max((item for item in certain if worst in item.views), key=lambda item: item.distance)
+
+
+def _misplacement(
+    views: tuple[int, int], points: Array, normals: Array, residuals: Array, depth: Array
+) -> Misplacement | None:
+    if len(points) < _MIN_POINTS:
+        return None
+    center = points.mean(axis=0)
+    radius = float(np.sqrt(((points - center) ** 2).sum(axis=1).mean()))
+    # Columns: translation, and rotation about the centre in units that move a point at the mean radius by as much.
+    motions = np.concatenate([normals, np.cross((points - center) / radius, normals)], axis=1)
+    off = np.abs(residuals - np.median(residuals))
+    inside = off <= np.maximum(_INLIER * 1.4826 * float(np.median(off)), _KEPT * depth)
+    for _ in range(_NUM_ROUNDS):
+        if inside.sum() < _MIN_POINTS:
+            return None
+        lengths, values, axes = _motion(motions[inside], residuals[inside])
+        left = residuals - motions @ (axes @ lengths)
+        scatter = 1.4826 * float(np.median(np.abs(left[inside])))
+        inside = np.abs(left) <= np.maximum(_INLIER * scatter, _KEPT * depth)
+    if not len(values):
+        return None
+    errors = scatter / np.sqrt(values)
+    worst = int(np.argmax(np.abs(lengths) - _SURE * errors))
+    return Misplacement(views, float(np.abs(lengths[worst])), float(errors[worst]), float(np.median(depth)))
+
+
+def _motion(motions: Array, residuals: Array) -> tuple[Array, Array, Array]:
+    """Return the least-squares motion along independent axes (metres), how many points tell of each, and the axes."""
+    values, axes = np.linalg.eigh(motions.T @ motions)
+    known = values > _TELLING
+    values, axes = values[known], axes[:, known]
+    return (axes.T @ (motions.T @ residuals)) / values, values, axes
+
+
+def _residuals(
+    here: PosedDepth, surface: SmoothSurface, other: PosedDepth, other_surface: SmoothSurface
+) -> tuple[Array, Array, Array, Array]:
+    """Return points of one view, their normals (world), metres along these to the other's surface, and their depth."""
+    chosen = np.zeros_like(surface.is_sure)
+    chosen[::_SPACING, ::_SPACING] = surface.is_sure[::_SPACING, ::_SPACING]
+    rows, columns = np.nonzero(chosen)
+    depth = here.depth[rows, columns].astype(np.float64)
+    rotation = here.cam_to_world[:3, :3]
+    points = (rays(here.intrinsics, columns, rows) * depth[:, None]) @ rotation.T + here.cam_to_world[:3, 3]
+    normals = surface.normals[rows, columns] @ rotation.T
+
+    seen = (points - other.cam_to_world[:3, 3]) @ other.cam_to_world[:3, :3]
+    in_front = seen[:, 2] > 1e-9
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = np.floor((seen @ other.intrinsics.T)[:, :2] / seen[:, 2:])
+    height, width = other.depth.shape
+    in_image = in_front & (pixels >= 0).all(axis=1) & (pixels < [width, height]).all(axis=1)
+    column, row = np.where(in_image[:, None], pixels, 0).astype(np.int64).T
+    # The plane of the pixel that sees the point, so that a pixel's width does not count as distance.
+    direction = rays(other.intrinsics, column, row)
+    facing = other_surface.normals[row, column]
+    offset = direction * other.depth[row, column].astype(np.float64)[:, None] - seen
+    distance = (offset * facing).sum(axis=1)
+    alike = (facing @ other.cam_to_world[:3, :3].T * normals).sum(axis=1)
+    sign = np.where(alike < 0, -1.0, 1.0)
+    near = np.abs(other.depth[row, column] - seen[:, 2]) <= _REACH * seen[:, 2]
+    kept = in_image & other_surface.is_sure[row, column] & near & (np.abs(alike) > 0.9)
+    return points[kept], normals[kept], (sign * distance)[kept], depth[kept]
