@@ -64,11 +64,10 @@ RUN = {
     "vpd-data inspect datasets/table": "",
     "vpd-data import recordings/table out=datasets/table height=128": "",
     "vpd-data validate datasets/table": "",
-    "vpd-train experiment=demo generate=null data.folder=datasets/table run.folder=runs/table ": TRAINING + LIGHT,
+    "vpd-train experiment=recordings data.folder=datasets/table run.folder=runs/table": TRAINING + LIGHT,
     "vpd-eval ckpt=runs/table/checkpoints/last.ckpt": EVALUATION,
-    "vpd-train experiment=demo generate=null data.folder=datasets/table run.folder=runs/table_even_rays ": TRAINING
-    + LIGHT,
-    "vpd-train experiment=demo generate=null data.folder=datasets/table run.folder=runs/table_vpd ": TRAINING,
+    "vpd-train experiment=recordings data.folder=datasets/table run.folder=runs/table_even_rays": TRAINING + LIGHT,
+    "vpd-train experiment=recordings data.folder=datasets/table run.folder=runs/table_vpd ": TRAINING,
 }
 # What does not run here: how a command begins, and why. The first that fits counts.
 NOT_RUN = {

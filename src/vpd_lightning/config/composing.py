@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from vpd_lightning.config.building import STAGES
 from vpd_lightning.config.effects import refuse_idle_words
-from vpd_lightning.config.explaining import explain, explain_missing_value, refuse_bypasses
+from vpd_lightning.config.explaining import explain, explain_missing_value, named_cause, refuse_bypasses
 from vpd_lightning.config.paths import config_folder
 from vpd_lightning.config.plugins import load_plugins
 from vpd_lightning.config.resolvers import register_resolvers
@@ -241,4 +241,5 @@ def _check_again(schema: type, config: Any) -> None:
     try:
         OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.to_container(config))
     except OmegaConfBaseException as error:
-        raise ConfigError(f"the configuration does not fit its schema.\n{str(error).splitlines()[0]}") from error
+        refused = ConfigError(f"the configuration does not fit its schema.\n{str(error).splitlines()[0]}")
+        raise (named_cause(error) or refused) from error

@@ -10,9 +10,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import InterpolationKeyError, MissingMandatoryValue, ValidationError
+from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError, MissingMandatoryValue, ValidationError
 
-from vpd_lightning.errors import ConfigError
+from vpd_lightning.errors import ConfigError, VPDError
 
 
 def refuse_bypasses(overrides: Sequence[str]) -> None:
@@ -42,7 +42,7 @@ def parsed(overrides: Sequence[str]) -> list[Override]:
 
 def explain(
     error: Exception, command: str, overrides: Sequence[str], compose: Callable[[Sequence[str]], Any]
-) -> ConfigError:
+) -> VPDError:
     """Return the error to show for one that came out of composing; ``compose`` composes fewer words."""
     cause = error.__cause__ or error
     text = str(error)
@@ -73,17 +73,28 @@ def explain(
         )
     if isinstance(error, AssertionError | TypeError):  # what OmegaConf does with a key below null, or with a list
         return _explain_unfit_word(overrides, compose)
-    if isinstance(error, InterpolationKeyError | MissingMandatoryValue):
+    if isinstance(error, InterpolationKeyError | InterpolationResolutionError | MissingMandatoryValue):
         return explain_missing_value(error)
     return ConfigError("the configuration cannot be composed.\n" + "\n".join(text.splitlines()[:3]))
 
 
-def explain_missing_value(error: Exception) -> ConfigError:
+def explain_missing_value(error: Exception) -> VPDError:
     """Return the error for a key without a value, or with a reference that leads nowhere."""
+    broken = named_cause(error)
+    if broken is not None:
+        return broken
     key = getattr(error, "full_key", None)
     if isinstance(error, MissingMandatoryValue):
         return ConfigError(f"{key or 'a key'} has no value.\nGive one: {key}=...")
     return ConfigError(f"{key or 'a key'} cannot be resolved.\n{str(error).splitlines()[0]}")
+
+
+def named_cause(error: BaseException) -> VPDError | None:
+    """Return the error of ours behind one of OmegaConf: a value asked for what is in a file, and that is broken."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, VPDError):
+        cause = cause.__cause__ or cause.__context__
+    return cause
 
 
 def suggest(word: str, known: Sequence[str]) -> str:

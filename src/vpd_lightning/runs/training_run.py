@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from vpd_lightning.config import build, build_list, build_simulator, compose
+from vpd_lightning.data.recorded_scene import RECORDINGS, recorded_scene_notes
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.losses.base import AbstractLoss
 from vpd_lightning.randomness import derive_seed
@@ -92,6 +93,8 @@ def fit(
     """Build everything and train: anew, from a checkpoint, or from the weights of a first training."""
     provide_data(config, overrides)
     require_trusted_data(config)
+    if is_rank_zero and config["scene"]["name"] == RECORDINGS:
+        print(*recorded_scene_notes(config["data"]["folder"], config["scene"]), sep="\n", flush=True)
     datamodule = build(config["data"], LightningDataModule, "data")
     datamodule.setup("fit")
     system = _build_system(config)
