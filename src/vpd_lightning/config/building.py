@@ -208,13 +208,16 @@ def resolve_class(target: Any, name: str, packages: Sequence[str]) -> type:
 
 
 def _missing_plugin(target: Any, name: str) -> ConfigError | None:
-    """Return the error for a class of a package that is not installed; nothing is imported."""
+    """Return the error for a class of a package that is not installed; nothing is imported.
+
+    No command to install it by that name: the name may be misspelt, or come from whoever sent the checkpoint.
+    """
     package = target.partition(".")[0] if isinstance(target, str) else ""
     if "." not in str(target) or not package.isidentifier() or find_spec(package) is not None:
         return None
     return ConfigError(
-        f"{name}._target_={target} needs the plug-in {package}, which is not installed here.\n"
-        f"pip install {package}, or the distribution that holds it (from its source: pip install -e FOLDER)."
+        f"{name}._target_={target} may not be built: the plug-in {package} is not installed here.\n"
+        "Check the name; or install it, if you trust where it comes from (its source: pip install -e FOLDER)."
     )
 
 

@@ -1,7 +1,8 @@
 """What recordings say about their scene: cameras, workspace, and lengths that fit its distance and the frame rate.
 
-Lengths that nobody measured follow from how far off the scene is and how fast things fall. The factors are means over
-the scenes whose lengths were chosen by hand (tossed block from 1.9 and 2.6 m, MOVi from 9 m, soft bodies from 18 m).
+Lengths that nobody measured follow from how far off the scene is and how fast things fall. The factors lie near the
+means over the scenes whose lengths were chosen by hand (tossed block from 1.9 and 2.6 m, MOVi
+from 9 m, soft bodies from 18 m).
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +34,7 @@ _OF_DISTANCE: dict[str, float | list[float]] = {
     "shadow_scales": [0.04, 0.08, 0.16],
     "moving_depth_threshold": 0.01,
 }
-"""Lengths as shares of the median distance of what is seen in the workspace."""
+"""Lengths as shares of the median depth between near and far."""
 
 _OF_FALL = 0.85
 """Displacement in a step, as a share of that of a body that fell as far as the cameras are off."""
