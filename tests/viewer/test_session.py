@@ -18,7 +18,7 @@ import trimesh
 import vpd_lightning as vpd
 from tests.editing.scenes import same
 from tests.viewer.opened import open_tossed_box
-from tests.waiting import HANG
+from tests.waiting import HANG, wait_until
 from vpd_lightning.editing.edit_files import load_edit, replay
 from vpd_lightning.editing.operations import Delete, Duplicate, Move
 from vpd_lightning.editing.selectors import Box, Everything
@@ -28,8 +28,10 @@ from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.viewer import progressive_view
 from vpd_lightning.viewer.exports import ExportFolder
 from vpd_lightning.viewer.opened_scene import OpenedScene
-from vpd_lightning.viewer.progressive_view import ProgressiveView, Request, Viewpoint
+from vpd_lightning.viewer.frame_cache import FrameCache
+from vpd_lightning.viewer.progressive_view import Pane, Pictures, ProgressiveView, Request
 from vpd_lightning.viewer.session import Session
+from vpd_lightning.viewer.viewpoints import FreeViewpoint, RecordedViewpoint
 
 LEFT = Box([-9, -9, -9], [0, 9, 9])
 
@@ -59,6 +61,41 @@ def test_an_edit_in_between_ends_a_simulation(opened: OpenedScene) -> None:
 
     assert not session.simulate(5, edit)
     assert session.now.num_steps == 0
+
+
+def test_what_was_simulated_is_not_simulated_again(opened: OpenedScene) -> None:
+    one, other = Session(opened), Session(opened)
+    one.simulate(3)
+    states = list(one.now.states)
+    other.simulate(2)
+    assert all(a is b for a, b in zip(other.now.states, states, strict=False))  # the unedited scene is everybody's
+    one.apply(Delete(LEFT), "without the left half")
+    assert one.other is opened.rollout and one.label(one.now) == "without the left half"
+    one.undo()
+    assert one.now is opened.rollout and one.other is None and one.label(one.now) == "as recorded"
+    one.redo()
+    one.simulate(2)
+    states = list(one.now.states)
+    one.simulate(4)
+    assert one.now.states[:3] == states and one.now.num_steps == 4
+    assert one.label(one.now) == "without the left half"
+    one.keep()
+    one.apply(Move(Everything(), (0.0, 0.0, 0.1)))
+    assert one.other is one.kept and one.label(one.now) == "without the left half, edited"
+    one.start_over()
+    assert one.now is opened.rollout and one.kept is None
+
+
+def test_a_session_names_bodies_and_finds_how_fast_they_are(opened: OpenedScene) -> None:
+    session = Session(opened)
+    assert session.body_names() == ["block"] * (len(session.cluster_sizes()) == 1) or len(session.body_names()) > 1
+    everything = int(session.now.editor.select(Everything()).sum())
+    in_bodies = int(session.now.editor.select(session.bodies()).sum())
+    assert in_bodies + int(session.now.editor.select(session.surroundings()).sum()) == everything
+    still = np.linalg.norm(session.velocity(session.surroundings()))
+    assert np.linalg.norm(session.velocity(session.bodies())) > still
+    with pytest.raises(EditError):
+        session.velocity(Box([50, 50, 50], [51, 51, 51]))
 
 
 def test_two_sessions_do_not_mix(opened: OpenedScene) -> None:
@@ -105,7 +142,10 @@ def test_figures_compare_with_the_recording_as_far_as_it_goes(opened: OpenedScen
     figures = session.measure(0, 0, image)
     assert 5 < figures["psnr"] < 60 and 0 < figures["chamfer"] < 0.5
     assert session.measure(0, 0, opened.truth[0, 0])["psnr"] == float("inf")
-    assert set(session.measure(last + 1, 0, image)) == {"particles"}
+    assert set(session.measure(last + 1, 0, image)) == {"particles"} and not session.has_truth(last + 1)
+    edited = Session(opened)
+    edited.apply(Delete(LEFT))
+    assert set(edited.measure(0, 0, image)) == {"particles"}  # what was recorded is not what was edited
     points, colors = opened.seen_points(0)
     assert len(points) == len(colors) > 100
     assert (points >= np.array(opened.workspace_min) - 1e-6).all() and (points <= np.array(opened.workspace_max)).all()
@@ -113,13 +153,14 @@ def test_figures_compare_with_the_recording_as_far_as_it_goes(opened: OpenedScen
 
 class Shown:
     def __init__(self) -> None:
-        self.pictures: list[tuple[np.ndarray, bool]] = []
+        self.pictures: list[tuple[list[np.ndarray], bool]] = []
         self.event = threading.Event()
         self.changed = threading.Condition()
 
-    def __call__(self, image: np.ndarray, is_full: bool) -> None:
+    def __call__(self, request: Request, pictures: Pictures, is_full: bool) -> None:
+        assert len(pictures) == len(request.panes)
         with self.changed:
-            self.pictures.append((image, is_full))
+            self.pictures.append((list(pictures), is_full))
             self.changed.notify_all()
         if is_full:
             self.event.set()
@@ -129,8 +170,8 @@ class Shown:
             assert self.changed.wait_for(lambda: len(self.pictures) >= number, timeout=HANG)
 
 
-def viewpoint(opened: OpenedScene, aspect: float = 1.0) -> Viewpoint:
-    return Viewpoint(opened.cameras.cam_to_world[0].double().numpy(), 0.8, aspect)
+def viewpoint(opened: OpenedScene, aspect: float = 1.0) -> FreeViewpoint:
+    return FreeViewpoint(opened.cameras.cam_to_world[0].double().numpy(), 0.8, aspect)
 
 
 def test_a_coarse_picture_comes_first_and_the_full_one_is_that_of_the_simulator(opened: OpenedScene) -> None:
@@ -138,15 +179,65 @@ def test_a_coarse_picture_comes_first_and_the_full_one_is_that_of_the_simulator(
     view = ProgressiveView(opened.simulator.renderer, shown)
     view._pixels_per_second = 1.0  # a slow machine
     try:
-        view.ask(Request([state], viewpoint(opened, 1.5), 40))
+        view.ask(Request([Pane(0, 0, state)], viewpoint(opened, 1.5), 40))
         assert shown.event.wait(HANG)
     finally:
         view.stop()
-    (coarse, is_coarse_full), (full, is_full) = shown.pictures
+    ((coarse,), is_coarse_full), ((full,), is_full) = shown.pictures
     assert coarse.shape == (24, 36, 3) and not is_coarse_full
     assert full.shape == (40, 60, 3) and is_full
     whole = opened.simulator.render([state], viewpoint(opened, 1.5).cameras(40))[0, 0]
     assert np.abs(full.astype(int) - (whole * 255).round().numpy().astype(int)).max() <= 1  # bands: other sums
+
+
+def test_a_film_is_drawn_ahead_and_loops_without_being_drawn_again(opened: OpenedScene) -> None:
+    shown, frames, states = Shown(), FrameCache(), [opened.scene.current] * 4
+    camera = RecordedViewpoint(opened.cameras[:1], 0)
+
+    def request(step: int) -> Request:
+        panes = [[Pane(7, other, states[other])] for other in range(len(states))]
+        return Request(panes[step], camera, 24, lambda: [Request(pane, camera, 24) for pane in panes])
+
+    counted = CountingRenderer(opened.simulator.renderer)
+    view = ProgressiveView(counted, shown, frames)
+    try:
+        view.ask(request(0))
+        counted.wait_for(4)
+        wait_until(lambda: all(view.is_ready(request(step)) for step in range(4)))
+        view.ask(request(2))  # what is kept is shown before this returns
+        assert shown.pictures[-1][1] and np.array_equal(shown.pictures[-1][0][0], frames.get((7, 2, 0, 24)))
+        states.append(opened.scene.current)  # one more step was simulated
+        view.film_grew()
+        counted.wait_for(5)
+        view.ask(Request([Pane(7, 0, states[0])], RecordedViewpoint(opened.cameras[1:2], 1), 24))
+        counted.wait_for(6)  # another camera sees something else
+        assert counted.count == 6
+        second = ProgressiveView(counted, shown, frames)  # another browser on the same scene
+        assert second.is_ready(request(3)) and counted.count == 6
+        second.stop()
+    finally:
+        view.stop()
+    with pytest.raises(ValueError, match="read-only"):
+        shown.pictures[-1][0][0][:] = 0
+
+
+class CountingRenderer:
+    """A renderer that counts its drawings."""
+
+    def __init__(self, renderer: AbstractRenderer) -> None:
+        self.renderer, self.count = renderer, 0
+        self.changed = threading.Condition()
+
+    def __call__(self, *arguments: Any) -> Any:
+        drawn = self.renderer(*arguments)
+        with self.changed:
+            self.count += 1
+            self.changed.notify_all()
+        return drawn
+
+    def wait_for(self, count: int) -> None:
+        with self.changed:
+            assert self.changed.wait_for(lambda: self.count >= count, timeout=HANG)
 
 
 class HeldRenderer:
@@ -176,11 +267,13 @@ def test_what_is_out_of_date_is_not_finished(opened: OpenedScene, monkeypatch: p
     )  # each drawing takes 100 s by this clock: coarse pictures stay small, bands one row high
     monkeypatch.setattr(progressive_view, "time", SimpleNamespace(perf_counter=lambda: float(next(ticks))))
     monkeypatch.setattr(progressive_view, "STILL_SECONDS", 0.0)
+    monkeypatch.setattr(progressive_view, "MIN_BAND", 1)
     shown, state = Shown(), opened.scene.current
     held = HeldRenderer(opened.simulator.renderer)
     view = ProgressiveView(opened.simulator.renderer, shown)
     view._renderer, view._pixels_per_second = held, 1.0
-    old = Request([state], viewpoint(opened), 64)
+    old = Request([Pane(0, 0, state)], viewpoint(opened), 64)
+    both = Request([Pane(1, 0, state), Pane(2, 0, state)], viewpoint(opened, 0.5), 32)
     try:
         view.ask(old)
         held.wait()
@@ -191,14 +284,14 @@ def test_what_is_out_of_date_is_not_finished(opened: OpenedScene, monkeypatch: p
         held.wait()
         held.draw()  # its first band
         held.wait()
-        assert [image.shape for image, _ in shown.pictures] == [(24, 24, 3)] * 2
+        assert [image.shape for (image,), _ in shown.pictures] == [(24, 24, 3)] * 2
         monkeypatch.setattr(progressive_view, "STILL_SECONDS", 600.0)
         view.ask(old)  # while its second band is drawn
         held.draw()
         held.wait()
         held.draw()  # the coarse picture of the third, which then waits until the camera is still
         shown.wait_for(3)
-        view.ask(Request([state, state], viewpoint(opened), 32))  # two scenes side by side
+        view.ask(both)  # two scenes side by side
         held.wait()
         monkeypatch.setattr(progressive_view, "STILL_SECONDS", 0.0)
         held.draw()
@@ -209,10 +302,10 @@ def test_what_is_out_of_date_is_not_finished(opened: OpenedScene, monkeypatch: p
     finally:
         held.let.release(1000)
         view.stop()
-    assert [image.shape[0] for image, is_full in shown.pictures if not is_full] == [24] * 4
-    full = [image for image, is_full in shown.pictures if is_full]
-    assert [image.shape for image in full] == [(32, 32, 3)]
-    assert np.array_equal(full[0][:, :16], full[0][:, 16:])
+    assert [images[0].shape[0] for images, is_full in shown.pictures if not is_full] == [24] * 4
+    full = [images for images, is_full in shown.pictures if is_full]
+    assert [image.shape for image in full[0]] == [(32, 16, 3)] * 2 and len(full) == 1
+    assert np.array_equal(*full[0])
     assert not held.begun.acquire(blocking=False)  # no drawing but those counted
 
 

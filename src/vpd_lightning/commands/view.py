@@ -45,7 +45,7 @@ def start(config: Mapping[str, Any]) -> Any:
     from vpd_lightning.viewer.guard import HOST, new_token
     from vpd_lightning.viewer.server import Viewer
 
-    viewer = Viewer(config["port"], new_token())
+    viewer = Viewer(config["port"], new_token(), config["kiosk"])
     try:
         print(f"Open {viewer.url}\n")
         print(f"From another machine: ssh -L {viewer.port}:{HOST}:{viewer.port} THIS_MACHINE, then the same address.")
@@ -69,13 +69,16 @@ def _show(viewer: Any, config: Mapping[str, Any]) -> None:
 
     set_threads(config["num_threads"])
     model = load_particle_simulator(config)
-    manifest = data_set(config["data"]["folder"], model.config, only=(config["split"], config["trajectory"]))
-    path = choose_trajectory(manifest, config["split"], config["trajectory"])
+    split, number = config["split"], config["trajectory"]
+    viewer.say("Looking for the recording; where its data are missing, it is made ...")
+    manifest = data_set(config["data"]["folder"], model.config, only=(split, number))
+    path = choose_trajectory(manifest, split, number)
     start_frame = config["start_frame"]
-    title = f"{model.name}, {manifest.relative(path)}, frame {start_frame}"
-    opened = open_scene(model.simulator, path, start_frame, model.input_views, title)
+    viewer.say("Looking at two frames of the recording ...")
+    title = f"{manifest.scene.replace('_', ' ')}, {split} recording {number}".capitalize()
+    opened = open_scene(model.simulator, path, start_frame, model.input_views, title, manifest.scene)
     viewer.show(opened, beside_checkpoint(model.path, "view"), config["num_steps"])
-    print(title, flush=True)
+    print(f"{model.name}, {manifest.relative(path)}, frame {start_frame}", flush=True)
 
 
 def _check(config: Mapping[str, Any]) -> None:
@@ -84,6 +87,9 @@ def _check(config: Mapping[str, Any]) -> None:
         if value < lowest or (highest is not None and value > highest):
             allowed = f"{lowest} or more" if highest is None else f"{lowest} to {highest}"
             raise ConfigError(f"{name}={value} is out of range.\nAllowed: {allowed}.")
+    kiosk = config["kiosk"]
+    if kiosk is not None and not kiosk >= 5:
+        raise ConfigError(f"kiosk={kiosk} is out of range.\nAllowed: 5 seconds or more, or null.")
 
 
 if __name__ == "__main__":

@@ -198,6 +198,7 @@ class ViewConfig(RecordingConfig):
     """Root of ``vpd-view``."""
 
     port: int = MISSING
+    kiosk: float | None = None
 
 
 @dataclass

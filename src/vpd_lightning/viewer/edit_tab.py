@@ -7,74 +7,90 @@ import numpy as np
 from vpd_lightning.editing.edit_files import load_edit
 from vpd_lightning.editing.operations import Delete, Duplicate, Move, Scale, SetVelocity
 from vpd_lightning.editing.selectors import Cluster, Color, Everything, Lasso, Selector
+from vpd_lightning.viewer.body_handles import BodyHandles
+from vpd_lightning.viewer.screen import PICTURE
 from vpd_lightning.viewer.session import COMBINATIONS
 from vpd_lightning.viewer.tab_host import TabHost
 
-_BESIDE = 0.3  # of the workspace's width: where a copy appears
+_NOTHING = "nothing"
 
 
 class EditTab:
-    """Selection by cluster, rectangle and colour; a gizmo that moves what is selected; edits, undo and comparison."""
+    """Selection by click, list, rectangle and colour; edits of what is selected; comparison; edits from a file."""
 
     def __init__(self, panel: TabHost):
         self.panel, self.session = panel, panel.session
         gui: Any = panel.client.gui
         self.status = gui.add_markdown("")
-        self.how = gui.add_dropdown("a new selection will", COMBINATIONS, initial_value="replace")
-        self.clusters = gui.add_dropdown("cluster", ("-",), initial_value="-")
-        self._button("Select cluster", self._select_cluster)
-        self.rectangle = gui.add_checkbox("drag rectangles", False, hint="while on, dragging selects")
+        self.clusters = gui.add_dropdown("body", (_NOTHING,), initial_value=_NOTHING)
+        self._button("Delete", self.delete)
+        self._button("Duplicate", self._duplicate)
+        self._button("Move by hand", self._move)
+        with gui.add_folder("velocity and size", expand_by_default=False):
+            self.velocity = gui.add_vector3("velocity (m a step)", (0.0, 0.0, 0.0), step=0.01)
+            self._button("Set velocity", self._set_velocity)
+            self.factor = gui.add_number("scale", 1.5, min=0.05, max=20.0, step=0.05)
+            self._button("Scale", self._scale)
         with gui.add_folder("more ways to select", expand_by_default=False):
+            self.how = gui.add_dropdown("a new selection will", COMBINATIONS, initial_value="replace")
+            self.rectangle = gui.add_checkbox("drag rectangles", False, hint="while on, dragging selects")
             self.color = gui.add_rgb("colour", (200, 60, 60))
             self.tolerance = gui.add_slider("tolerance", 0.02, 0.6, 0.02, 0.2)
             self._button("Select colour", self._select_color)
             self._button("Select all", lambda: self._select(Everything()))
             self._button("Select none", lambda: self._select(None))
-        self._button("Delete", lambda: self._apply(Delete(self.session.need_selection())))
-        self._button("Duplicate", self._duplicate)
-        self._button("Move by gizmo", self._move)
-        with gui.add_folder("velocity and size", expand_by_default=False):
-            self.velocity = gui.add_vector3("velocity (m a step)", (0.0, 0.0, 0.0), step=0.01)
-            self._button("Set velocity", self._set_velocity)
-            self.factor = gui.add_number("scale", 1.5, min=0.05, max=20.0, step=0.05)
-            self._button("Scale", lambda: self._apply(Scale(self.session.need_selection(), self.factor.value)))
-        self._button("Undo", lambda: self._edit(self.session.undo))
-        self._button("Redo", lambda: self._edit(self.session.redo))
-        with gui.add_folder("compare", expand_by_default=False):
-            self._button("Keep beside", self._keep)
-            self._button("Swap with kept", lambda: self._edit(self.session.swap))
-            self._button("Forget kept", self._forget)
+        with gui.add_folder("compare with", expand_by_default=False):
+            self._button("This scene from now on", self._keep)
+            self._button("Swap the two", lambda: panel.edit(self.session.swap))
+            self._button("The recording again", self._forget)
         self.upload = gui.add_upload_button("Load edit (YAML)", mime_type=".yaml")
         self.upload.on_upload(lambda _: panel.act(self._load))
+        self.clusters.on_update(lambda event: panel.act(lambda: self._chosen(event)))
         self.rectangle.on_update(lambda _: panel.act(self._arm_rectangle))
-        self._gizmo: Any = None
-        self._preview: Any = None
+        self.handles = BodyHandles(panel, self.select_cluster, self.move)
         self._armed = False
-        self.refresh()
 
     def _button(self, label: str, action: Any) -> None:
         self.panel.client.gui.add_button(label).on_click(lambda _: self.panel.act(action))
 
     def refresh(self) -> None:
-        """Show the clusters and the selection of the edited scene."""
+        """Show the bodies and the selection of the edited scene."""
+        names = self.session.body_names()
         sizes = self.session.cluster_sizes()
-        options = tuple(f"{number} ({size} particles)" for number, size in enumerate(sizes)) or ("-",)
+        options = (_NOTHING, *(f"{name} ({size} particles)" for name, size in zip(names, sizes, strict=True)))
         if self.clusters.options != options:
             self.clusters.options = options
-        count = int(self.session.selected.sum())
-        text = f"**{count}** particles selected, {len(self.session.operations())} edits"
-        self.status.content = text + ("  \nDrag a rectangle around what to select." if self._armed else "")
-        self._place_gizmo()
+        self._show_selection()
+        self.handles.make()
+
+    def _show_selection(self) -> None:
+        selector, count = self.session.selector, int(self.session.selected.sum())
+        is_body = isinstance(selector, Cluster) and selector.number + 1 < len(self.clusters.options)
+        self.clusters.value = self.clusters.options[selector.number + 1 if is_body else 0]  # type: ignore[union-attr]
+        what = f"**{self._name()}** is selected: {count} particles" if count else "Click a body to select it."
+        self.status.content = what + ("  \nDrag a rectangle around what to select." if self._armed else "")
+        self.handles.show_selected()
+
+    def _name(self) -> str:
+        """Return what is selected, in words."""
+        selector, names = self.session.selector, self.session.body_names()
+        if isinstance(selector, Cluster) and selector.number < len(names):
+            return f"the {names[selector.number]}"
+        return "the selection"
 
     def _select(self, selector: Selector | None) -> None:
-        self.panel.step.value = 0
         self.session.select(selector, self.how.value)
-        self.refresh()
+        self._show_selection()
         self.panel.redraw()
 
-    def _select_cluster(self) -> None:
-        number = self.clusters.value.split()[0]
-        self._select(Cluster(int(number)) if number.isdigit() else None)
+    def select_cluster(self, number: int | None) -> None:
+        """Select a body, or nothing."""
+        self._select(None if number is None else Cluster(number))
+
+    def _chosen(self, event: Any) -> None:
+        if event.client is not None and self.clusters.value in self.clusters.options:
+            number = self.clusters.options.index(self.clusters.value) - 1
+            self.select_cluster(number if number >= 0 else None)
 
     def _select_color(self) -> None:
         self._select(Color([channel / 255 for channel in self.color.value], self.tolerance.value))
@@ -84,41 +100,80 @@ class EditTab:
         scene.remove_rect_select_callback()
         self._armed = bool(self.rectangle.value)
         if self._armed:
+            self.panel.set_mode(PICTURE)
 
             @scene.on_rect_select()
             def _(event: Any) -> None:
                 self.panel.act(lambda: self._select(self.rectangle_selector(event.screen_min, event.screen_max)))
 
-        self.refresh()  # the hint reaches the browser after the callback: whoever sees it can drag
+        self._show_selection()  # the hint reaches the browser after the callback: whoever sees it can drag
 
     def rectangle_selector(self, low: tuple[float, float], high: tuple[float, float]) -> Selector:
-        """Return what the browser's camera sees in a rectangle of the screen (shares of its width and height)."""
-        cameras = self.panel.viewpoint().cameras(1000)
+        """Return what the browser's camera sees in a rectangle of the screen (shares of its width and height).
+
+        Where there are bodies in it, those parts of them, and not the floor behind.
+        """
+        cameras = self.panel.screen.free_viewpoint().cameras(1000)
         (left, top), (right, bottom) = (np.array(p) * (cameras.width, cameras.height) for p in (low, high))
         corners = [[left, top], [right, top], [right, bottom], [left, bottom]]
-        return Lasso(
+        lasso = Lasso(
             cameras.intrinsics[0].double().tolist(),
             cameras.cam_to_world[0].double().tolist(),
             [[float(x), float(y)] for x, y in corners],
         )
+        bodies = self.session.bodies()
+        in_front = lasso if bodies is None else lasso & bodies
+        return in_front if bool(self.session.now.editor.select(in_front).any()) else lasso
 
-    def _apply(self, operation: Any) -> None:
-        self._edit(lambda: self.session.apply(operation))
+    # Edits
 
-    def _edit(self, action: Any) -> None:
-        action()
-        self.panel.edited()
+    def delete(self) -> None:
+        """Take away what is selected."""
+        self._apply(Delete(self.session.need_selection()), f"without {self._name()}")
+
+    def _apply(self, operation: Any, label: str) -> None:
+        self.panel.edit(lambda: self.session.apply(operation, label))
 
     def _duplicate(self) -> None:
-        width = self.panel.opened.workspace_max[0] - self.panel.opened.workspace_min[0]
-        self._apply(Duplicate(self.session.need_selection(), (_BESIDE * width, 0.0, 0.0)))
+        """Put a copy where the camera sees it: beside the original, across the line of sight, and not over it."""
+        selector, name = self.session.need_selection(), self._name()
+        points = self.session.now.states[0].positions[0][self.session.selected].double().cpu().numpy()
+        right = self.panel.screen.viewpoint().cameras(100).cam_to_world[0, :3, 0].double().numpy()
+        right[2] = 0.0
+        right /= max(float(np.linalg.norm(right)), 1e-9)
+        width = float(np.ptp(points @ right))
+        low, high = np.array(self.panel.opened.workspace_min), np.array(self.panel.opened.workspace_max)
+        center, room = points.mean(axis=0), 0.5 * width
+        shifts = [sign * 1.3 * width * right for sign in (1.0, -1.0)]
+        fits = [shift for shift in shifts if ((center + shift > low + room) & (center + shift < high - room))[:2].all()]
+        self._apply(
+            Duplicate(selector, tuple((fits or shifts)[0].tolist())), f"with a second {name.removeprefix('the ')}"
+        )
 
     def _set_velocity(self) -> None:
-        self._apply(SetVelocity(self.session.need_selection(), tuple(self.velocity.value)))
+        name = self._name()
+        self._apply(SetVelocity(self.session.need_selection(), tuple(self.velocity.value)), f"{name} thrown otherwise")
+
+    def _scale(self) -> None:
+        name, factor = self._name(), self.factor.value
+        self._apply(Scale(self.session.need_selection(), factor), f"{name} scaled by {factor:g}")
+
+    def move(self, shift: list[float], wxyz: tuple[float, ...], center: list[float]) -> None:
+        """Turn what is selected about ``center``, then shift it (metres)."""
+        turn = (wxyz[0], wxyz[1], wxyz[2], wxyz[3])
+        self._apply(Move(self.session.need_selection(), shift, turn, center), f"{self._name()} moved")
+
+    def _move(self) -> None:
+        """Show the scene from the browser's camera at its first step, where what is selected can be dragged."""
+        self.session.need_selection()
+        self.panel.set_playing(False)
+        self.panel.screen.compares = self.panel.view_tab.compares.value = False
+        self.panel.set_mode(PICTURE)
+        self.panel.go_to(0)
 
     def _keep(self) -> None:
         self.session.keep()
-        self.panel.notify("Kept", "It stands beside; edit on, and simulate to compare.")
+        self.panel.notify("Kept", "What is edited from now on is compared with this scene.")
         self.panel.redraw()
 
     def _forget(self) -> None:
@@ -138,47 +193,6 @@ class EditTab:
             self.session.apply(operation)
         self.panel.edited()
 
-    # The gizmo
-
-    def _place_gizmo(self) -> None:
-        for handle in (self._gizmo, self._preview):
-            if handle is not None:
-                handle.remove()
-        self._gizmo = self._preview = None
-        chosen = self.session.selected
-        if not bool(chosen.any()):
-            return
-        points = self.session.now.states[0].positions[0][chosen].double().cpu().numpy()
-        center = points.mean(axis=0)
-        scene = self.panel.client.scene
-        size = max(float(np.linalg.norm(np.ptp(points, axis=0))), 0.05)
-        self._preview = scene.add_point_cloud(
-            "/preview",
-            (points - center).astype(np.float32),
-            (255, 200, 80),
-            point_size=self.panel.point_size.value / 100,
-            precision="float32",
-            position=center,
-            visible=False,
-        )
-        self._gizmo = scene.add_transform_controls("/gizmo", scale=0.7 * size, depth_test=False, position=center)
-
-        @self._gizmo.on_update
-        def _(_: Any) -> None:
-            if self._preview is not None and self._gizmo is not None:
-                self._preview.visible = True
-                self._preview.position, self._preview.wxyz = self._gizmo.position, self._gizmo.wxyz
-
-    def show_gizmo(self, visible: bool) -> None:
-        """Show the gizmo where there is one: an edit is of the last input frame, and not of what is predicted."""
-        if self._gizmo is not None:
-            self._gizmo.visible = visible
-
-    def _move(self) -> None:
-        selector = self.session.need_selection()
-        if self._gizmo is None:
-            return
-        chosen = self.session.selected
-        center = self.session.now.states[0].positions[0][chosen].double().mean(dim=0).cpu().numpy()
-        shift = (np.asarray(self._gizmo.position) - center).tolist()
-        self._apply(Move(selector, shift, tuple(float(value) for value in self._gizmo.wxyz), center.tolist()))
+    def show_handles(self, visible: bool) -> None:
+        """Let bodies be dragged: an edit is of the last input frame, and not of what is predicted."""
+        self.handles.show(visible)

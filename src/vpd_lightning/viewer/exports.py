@@ -13,10 +13,13 @@ from vpd_lightning.errors import EditError
 from vpd_lightning.media.nerfstudio_paths import write_camera_path
 from vpd_lightning.media.particle_files import write_glb, write_particles
 from vpd_lightning.media.ply import write_ply
-from vpd_lightning.media.video import write_video
+from vpd_lightning.media.pictures import write_png
+from vpd_lightning.media.video import FILM_FORMATS, write_video
 from vpd_lightning.types import Cameras, Particles
 
 PARTICLE_FORMATS = ("ply", "glb", "npz")
+
+__all__ = ["FILM_FORMATS", "PARTICLE_FORMATS", "ExportFolder", "as_pose"]
 
 
 class ExportFolder:
@@ -52,10 +55,16 @@ class ExportFolder:
             write_glb(path, positions, colors[there])
         return path
 
-    def film(self, frames: UInt8[NDArray, "time height width 3"], fps: float) -> Path:
-        """Write a film as WebM (VP9)."""
-        path = self.free("rollout", "webm")
+    def film(self, frames: UInt8[NDArray, "time height width 3"], fps: float, suffix: str = "webm") -> Path:
+        """Write a film in one of ``FILM_FORMATS``."""
+        path = self.free("rollout", suffix)
         write_video(path, frames, fps)
+        return path
+
+    def picture(self, image: UInt8[NDArray, "height width 3"]) -> Path:
+        """Write a picture as PNG."""
+        path = self.free("picture", "png")
+        write_png(path, image)
         return path
 
     def camera_path(self, cameras: Cameras, fps: float) -> Path:

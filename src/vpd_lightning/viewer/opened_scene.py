@@ -1,7 +1,7 @@
 """What the viewer shows: a trained simulator, two frames of a recording, and what really happened then."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -13,17 +13,20 @@ from torch import Tensor
 
 from vpd_lightning.data.clip import read_clip
 from vpd_lightning.data.reader import TrajectoryReader
+from vpd_lightning.editing.colored_editor import colored_editor
 from vpd_lightning.evaluation.prediction import encode_clip
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.media.camera_paths import common_target
 from vpd_lightning.media.particle_colors import particle_colors
 from vpd_lightning.simulator import Scene, Simulator
 from vpd_lightning.types import Cameras, Particles
+from vpd_lightning.viewer.frame_cache import FrameCache
+from vpd_lightning.viewer.rollout import Rollout
 
 
 @dataclass(frozen=True)
 class OpenedScene:
-    """A model and a recording, shared by all clients and never changed.
+    """A model and a recording, shared by all clients and never changed; what was drawn of it is kept.
 
     ``truth`` are the recorded images from the last input frame on (time 0), as long as the recording goes.
     """
@@ -38,6 +41,9 @@ class OpenedScene:
     path: Path
     start: int
     title: str
+    kind: str  # of the data set: the name of the generated scene, "imported", ...
+    rollout: Rollout  # of the scene as recorded; grows while it is simulated
+    frames: FrameCache = field(default_factory=FrameCache)
 
     @cached_property
     def viewpoint(self) -> Float[Tensor, " 3"]:
@@ -90,8 +96,10 @@ class OpenedScene:
         return points[inside].astype(np.float32), rgb[inside]
 
 
-def open_scene(simulator: Simulator, path: Path, start: int, input_views: Sequence[int], title: str) -> OpenedScene:
-    """Read a recording and encode the frames ``start`` and ``start + 1``.
+def open_scene(
+    simulator: Simulator, path: Path, start: int, input_views: Sequence[int], title: str, kind: str = ""
+) -> OpenedScene:
+    """Read a recording and encode the frames ``start`` and ``start + 1``; ``kind`` is the scene of its data set.
 
     Raises:
         DataError: the recording lacks them.
@@ -104,4 +112,8 @@ def open_scene(simulator: Simulator, path: Path, start: int, input_views: Sequen
         low, high = reader.workspace_min, reader.workspace_max
     cameras = Cameras(torch.from_numpy(intrinsics[0]).float(), torch.from_numpy(poses[0]).float(), height, width)
     scene = encode_clip(simulator, clip, list(input_views))
-    return OpenedScene(simulator, scene, cameras, truth, tuple(input_views), low, high, path, start, title)
+    viewpoint = cameras.cam_to_world[list(input_views), :3, 3].mean(dim=0)
+    return OpenedScene(
+        simulator, scene, cameras, truth, tuple(input_views), low, high, path, start, title, kind,
+        Rollout(simulator, colored_editor(simulator, scene, viewpoint)),
+    )  # fmt: skip

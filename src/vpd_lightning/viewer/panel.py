@@ -12,89 +12,102 @@ from vpd_lightning.errors import VPDError
 from vpd_lightning.metrics.registry import CHAMFER, PSNR, metric
 from vpd_lightning.viewer.edit_tab import EditTab
 from vpd_lightning.viewer.export_tab import ExportTab
-from vpd_lightning.viewer.exports import ExportFolder, as_pose
+from vpd_lightning.viewer.exports import ExportFolder
 from vpd_lightning.viewer.opened_scene import OpenedScene
-from vpd_lightning.viewer.progressive_view import ProgressiveView, Request, Viewpoint
+from vpd_lightning.viewer.preset_buttons import PresetButtons
+from vpd_lightning.viewer.progressive_view import Pictures, ProgressiveView, Request
 from vpd_lightning.viewer.scene_drawing import SceneDrawing
+from vpd_lightning.viewer.screen import FILM, PARTICLES, PICTURE, Screen
 from vpd_lightning.viewer.session import Session
 from vpd_lightning.viewer.tab_host import TabHost
+from vpd_lightning.viewer.view_tab import ViewTab
 
-MODES = ("particles", "rendered", "both")
-_POINT_SIZE = 1.5  # centimetres
+_MOVED = 0.001
+"""A camera that moved by this share of its distance to what it looks at was moved by hand."""
+
+_POLL_SECONDS = 0.02
 
 
 class Panel(TabHost):
-    """Connects a browser with a session; every client has its own, so that nothing is shared but the model."""
+    """Connects a browser with a session; every client has its own, so that nothing is shared but the model.
 
-    def __init__(self, client: viser.ClientHandle, opened: OpenedScene, folder: ExportFolder, num_steps: int):
+    A ``session`` of a page that was left may be given, with the ``step`` that it showed.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        opened: OpenedScene,
+        folder: ExportFolder,
+        num_steps: int,
+        session: Session | None = None,
+        mode: str = FILM,
+    ):
         self.client, self.opened, self.folder = client, opened, folder
-        self.session = Session(opened)
+        self.session = Session(opened) if session is None else session
+        self.screen = Screen(client, self.session)
+        self.screen.mode = mode
         self.drawing = SceneDrawing(client, self.session)
-        self.view = ProgressiveView(opened.simulator.renderer, self._show_picture)
+        self.view = ProgressiveView(opened.simulator.renderer, self._show_picture, opened.frames)
+        self.touched_at = time.monotonic()
         self._playing, self._closed = threading.Event(), threading.Event()
         self._busy = threading.Lock()
-        self._looks_through: int | None = None
+        self._told, self._arrived = np.zeros(3), False  # where the browser's camera was put, and whether it went there
         gui: Any = client.gui
-        gui.configure_theme(show_share_button=False, control_width="medium")
-        self.look_through(opened.input_views[0])
-        self.drawing.first_particles(_POINT_SIZE / 100)  # the buttons and the renderer's colours take a second more
-        gui.add_markdown(f"**{opened.title}**")
-        with gui.add_folder("Rollout"):
-            self.step = gui.add_slider("step", 0, 1, 1, 0, disabled=True)
-            self.transport = gui.add_button_group("time", ("start", "back", "step", "play"))
-            self.fps = gui.add_slider("steps per second", 1, 30, 1, 10)
-            self.length = gui.add_number("steps to simulate", num_steps, min=1, max=1000, step=1)
-            self.simulate = gui.add_button("Simulate")
-            self.figures = gui.add_markdown("")
+        self.look_through(self.screen.view)
+        gui.add_markdown(f"### {opened.title}")
+        self.said = gui.add_markdown("")
+        self.play = gui.add_button("Pause", icon="player-pause")
+        self.step = gui.add_slider("step", 0, 1, 1, 0, disabled=True)
+        self.figures = gui.add_markdown("")
+        self.presets = PresetButtons(self)
+        self.history = gui.add_button_group("history", ("Undo", "Redo", "Start over"))
         tabs = gui.add_tab_group()
+        with tabs.add_tab("View"):
+            self.view_tab = ViewTab(self, num_steps)
         with tabs.add_tab("Edit"):
             self.edit_tab = EditTab(self)
-        with tabs.add_tab("View"):
-            self._add_view_tab()
-        with tabs.add_tab("Truth"):
-            self._add_truth_tab()
-        with tabs.add_tab("Export"):
+        with tabs.add_tab("Save"):
             self.export_tab = ExportTab(self)
-        self.step.on_update(lambda _: self.redraw())
-        self.transport.on_click(lambda _: self.act(self._transport))
-        self.simulate.on_click(lambda _: self.act(self.run_simulation))
-        client.camera.on_update(lambda _: self.ask_picture())
-        threading.Thread(target=self._play, daemon=True, name="vpd-view playing").start()
+        self.play.on_click(lambda _: self.act(self.toggle_play))
+        self.step.on_update(lambda event: self.act(lambda: self._step_chosen(event)))
+        self.history.on_click(lambda _: self.act(self._history))
+        client.scene.on_click()(lambda event: self.act(lambda: self._clicked(event)))
+        client.camera.on_update(lambda _: self.act(self._camera_moved))
+        self._add_keys()
+        self.edit_tab.refresh()
+        self.presets.refresh()
+        self.set_playing(True)
         self.redraw()
+        for work in (self._play, self.run_simulation):
+            threading.Thread(target=work, daemon=True, name="vpd-view film").start()
 
-    def _add_view_tab(self) -> None:
-        gui: Any = self.client.gui
-        self.mode = gui.add_dropdown("show", MODES, initial_value="particles")
-        self.rows = gui.add_slider("rows of the picture", 32, 768, 16, 256)
-        self.point_size = gui.add_slider("point size (cm)", 0.2, 10.0, 0.1, _POINT_SIZE)
-        self.cameras_shown = gui.add_checkbox("cameras", True)
-        self.truth_shown = gui.add_checkbox("measured points", False)
-        look = gui.add_dropdown(
-            "look through camera",
-            tuple(str(view) for view in range(len(self.opened.cameras.intrinsics))),
-            initial_value="0",
+    def _add_keys(self) -> None:
+        def step(by: int) -> None:
+            self.set_playing(False)
+            self.go_to(min(max(int(self.step.value) + by, 0), self._last_step()))
+
+        keys: tuple[tuple[str, str, str | None, Callable[[], Any]], ...] = (
+            ("Play or pause", "space", None, self.toggle_play),
+            ("Next step", "arrowright", None, lambda: step(1)),
+            ("Step back", "arrowleft", None, lambda: step(-1)),
+            ("Delete what is selected", "delete", None, self.edit_tab.delete),
+            ("Undo", "Z", "cmd/ctrl", lambda: self.edit(self.session.undo)),
+            ("Redo", "Y", "cmd/ctrl", lambda: self.edit(self.session.redo)),
+            ("Select nothing", "escape", None, lambda: self.select_body(None)),
         )
-        for handle in (self.mode, self.rows, self.point_size, self.cameras_shown, self.truth_shown):
-            handle.on_update(lambda _: self.redraw())
-
-        @look.on_update
-        def _(_: Any) -> None:
-            self.look_through(int(look.value))
-            self.redraw()
-
-    def _add_truth_tab(self) -> None:
-        gui: Any = self.client.gui
-        views = tuple(str(view) for view in range(len(self.opened.cameras.intrinsics)))
-        self.truth_view = gui.add_dropdown("camera", views, initial_value=str(self.opened.input_views[0]))
-        blank = np.zeros((self.opened.cameras.height, self.opened.cameras.width, 3), np.uint8)
-        self.true_image = gui.add_image(blank, label="recorded")
-        self.predicted_image = gui.add_image(blank, label="predicted")
-        self.truth_view.on_update(lambda _: self.redraw())
+        for label, hotkey, modifier, action in keys:
+            command = self.client.gui.add_command(label, hotkey=hotkey, modifier=modifier)  # type: ignore[arg-type]
+            command.on_trigger(lambda _, action=action: self.act(action))
 
     # What happens
 
     def act(self, action: Callable[[], Any]) -> None:
         """Do what a button asks for; what cannot be done is said in the browser, and nothing else happens."""
+        self.touched_at = time.monotonic()
+        self._attempt(action)
+
+    def _attempt(self, action: Callable[[], Any]) -> None:
         try:
             action()
         except VPDError as error:
@@ -104,129 +117,247 @@ class Panel(TabHost):
 
     def notify(self, title: str, text: str, color: Any = "green") -> None:
         """Say something in the browser."""
-        self.client.add_notification(title, text, auto_close_seconds=8, color=color)
+        if not self._closed.is_set():
+            self.client.add_notification(title, text, auto_close_seconds=8, color=color)
 
     def run_simulation(self) -> None:
-        """Simulate the edited scene, showing each step as it comes."""
-        if not self._busy.acquire(blocking=False):
-            return
-        try:
-            start = time.perf_counter()
-            wanted = int(self.length.value)
+        """Simulate the scene shown, and what it is compared with, as far as asked for; the film grows meanwhile."""
+        with self._busy:
+            for _ in iter(self._simulate_once, True):
+                pass
 
-            def show(step: int) -> None:
-                self._allow_steps()
-                self.step.value = step
+    def _simulate_once(self) -> bool:
+        """Simulate; False where an edit came in between, and there is another scene to simulate."""
+        wanted, session = int(self.view_tab.length.value), self.session
 
-            if self.session.simulate(wanted, show):
-                each = (time.perf_counter() - start) / wanted
-                self.notify("Simulated", f"{wanted} steps, {1000 * each:.0f} ms each")
-        finally:
-            self._busy.release()
-        self.redraw()
+        def shown(_: int) -> None:
+            self._allow_steps()
+            self.view.film_grew()
+
+        done = [True]
+
+        def simulate() -> None:
+            other = session.other
+            if other is not None:
+                other.reach(wanted)
+            done[0] = session.simulate(wanted, shown)
+
+        self._attempt(simulate)
+        return done[0] or self._closed.is_set()
+
+    def simulate_again(self) -> None:
+        """Simulate in the background, unless that goes on already."""
+        if not self._busy.locked():
+            threading.Thread(target=self.run_simulation, daemon=True, name="vpd-view simulation").start()
+
+    def edit(self, action: Callable[[], Any]) -> None:
+        """Edit the scene, and show what becomes of it."""
+        action()
+        self.edited()
 
     def edited(self) -> None:
-        """Show a scene that was just edited."""
-        self._playing.clear()
+        """Show a scene that was just edited: from its beginning, playing."""
         self._allow_steps()
-        self.step.value = 0
         self.edit_tab.refresh()
+        self.presets.refresh()
+        self.go_to(0)
+        self.simulate_again()
+        self.set_playing(True)
+
+    def select_body(self, cluster: int | None) -> None:
+        """Select a body, or nothing."""
+        self.edit_tab.select_cluster(cluster)
+
+    def start_over(self) -> None:
+        """Begin again as on the first visit."""
+        self.session.start_over()
+        self.screen.compares = self.view_tab.compares.value = True
+        self.view_tab.mode.value = self.screen.mode = FILM
+        self.look_through(self.screen.view)
+        self.edited()
+
+    @property
+    def is_untouched(self) -> bool:
+        """Whether the page shows what the first visit shows."""
+        session = self.session
+        nothing_done = session.now is self.opened.rollout and session.kept is None and session.selector is None
+        return nothing_done and self.screen.mode == FILM and self._playing.is_set()
+
+    def _history(self) -> None:
+        word = self.history.value
+        if word == "Start over":
+            self.start_over()
+        else:
+            self.edit(self.session.undo if word == "Undo" else self.session.redo)
+
+    def _clicked(self, event: Any) -> None:
+        x, y = event.screen_pos
+        body = self.screen.pick(float(x), float(y), int(self.step.value))
+        if body is not None or bool(self.session.selected.any()):
+            self.select_body(body)
+
+    def _step_chosen(self, event: Any) -> None:
+        if event.client is not None:  # a person, not ``go_to``
+            self.set_playing(False)
+            self.redraw()
+
+    # Playing
+
+    def toggle_play(self) -> None:
+        """Play, or pause."""
+        self.set_playing(not self._playing.is_set())
+
+    def set_playing(self, plays: bool) -> None:
+        """Let the film run, or stop it where it is."""
+        if plays:
+            self._playing.set()
+        else:
+            self._playing.clear()
+        self.play.label = "Pause" if plays else "Play"
+        self.play.icon = "player-pause" if plays else "player-play"
+        if not plays:
+            self.redraw()
+
+    def go_to(self, step: int) -> None:
+        """Show a step."""
+        self.step.value = step
         self.redraw()
 
+    def _last_step(self) -> int:
+        rollouts = self.screen.rollouts()
+        return min(int(self.view_tab.length.value), max(rollout.num_steps for rollout in rollouts))
+
     def _allow_steps(self) -> None:
-        last = self.session.now.num_steps
-        if self.session.kept is not None:
-            last = max(last, self.session.kept.num_steps)
+        last = self._last_step()
         self.step.disabled = last == 0
         self.step.max = max(last, 1)
-
-    def _transport(self) -> None:
-        word = self.transport.value
-        last = max(self.session.now.num_steps, self.session.kept.num_steps if self.session.kept else 0)
-        if last == 0:
-            self.run_simulation()
-            return
-        if word == "play":
-            if self._playing.is_set():
-                self._playing.clear()
-            else:
-                self._playing.set()
-            return
-        self._playing.clear()
-        now = int(self.step.value)
-        self.step.value = 0 if word == "start" else min(max(now + (1 if word == "step" else -1), 0), last)
 
     def _play(self) -> None:
         while not self._closed.is_set():
             if not self._playing.wait(timeout=0.5) or self._closed.is_set():
                 continue
-            last = int(self.step.max)
-            self.step.value = 0 if int(self.step.value) >= last else int(self.step.value) + 1
-            self._closed.wait(1.0 / self.fps.value)
+            self._attempt(self._advance)
+
+    def _advance(self) -> None:
+        """Show the next step as soon as its picture is there."""
+        last = self._last_step()
+        following = int(self.step.value) + 1
+        if following > last:
+            following = 0 if last > 0 and not self._busy.locked() else last
+        request = self.request(following)
+        if following == int(self.step.value) or (request is not None and not self.view.is_ready(request)):
+            self._closed.wait(_POLL_SECONDS)
+            return
+        self.go_to(following)
+        self._closed.wait(1.0 / self.view_tab.fps.value)
 
     # What is shown
 
     def redraw(self) -> None:
         """Draw the current step."""
-        self.act(self._redraw)
+        self._attempt(self._redraw)
 
     def _redraw(self) -> None:
-        step = int(self.step.value)
-        with_points = self.mode.value != "rendered"
-        self.drawing.particles(step, with_points, self.point_size.value / 100)
-        self.drawing.cameras(self.cameras_shown.value, self._looks_through)
-        self.drawing.measured(step if self.truth_shown.value else None, self.point_size.value / 100)
-        self.edit_tab.show_gizmo(step == 0)
+        step, mode = int(self.step.value), self.screen.mode
+        size = self.view_tab.point_size.value / 100
+        alone = len(self.screen.rollouts()) == 1
+        in_space = mode == PARTICLES or (mode == PICTURE and alone)
+        self.drawing.particles(step, mode == PARTICLES, size, self.screen.compares)
+        self.drawing.cameras(in_space and self.view_tab.cameras_shown.value, self.screen.view)
+        self.drawing.measured(step if in_space and self.view_tab.truth_shown.value else None, size)
+        self.edit_tab.show_handles(in_space and step == 0)
+        self.said.content = self._sentence()
         self.ask_picture()
-        if not self._playing.is_set() and not self._busy.locked():
-            self._show_truth(step)
+        self._show_figures(step)
 
-    def _show_truth(self, step: int) -> None:
-        view = int(self.truth_view.value)
-        image = self.session.render(step, self.opened.cameras[view : view + 1])[0]
-        self.predicted_image.image = image
-        known = step <= self.opened.num_true_steps
-        self.true_image.image = self.opened.truth[step, view] if known else np.zeros_like(image)
-        figures = self.session.measure(step, view, image)
-        lines = [f"step **{step}** of {self.session.now.num_steps}, {int(figures['particles'])} particles"]
-        if known:
+    def _sentence(self) -> str:
+        if self.screen.mode == PARTICLES:
+            return "The particles that the model moves. Drag to look around."
+        if len(self.screen.rollouts()) > 1:
+            first, second = (self.session.label(rollout) for rollout in self.screen.rollouts())
+            return f"The same throw twice, as the model predicts it: **{first}**, and **{second}**."
+        if self.screen.mode == PICTURE:
+            return "What the model predicts, from any side. Drag to look around."
+        return (
+            "The model saw **two frames** and predicts the rest. Bright in the error is wrong. "
+            "Click a body, or take it away."
+        )
+
+    def _show_figures(self, step: int) -> None:
+        session = self.session
+        now = session.now
+        lines = [f"step **{min(step, now.num_steps)}** of {now.num_steps}"]
+        if now.is_edited:
+            lines.append("edited: no truth to compare with")
+        elif step > self.opened.num_true_steps:
+            lines.append("the recording has ended: no truth to compare with")
+        elif (found := self._measured(step)) is not None:
             seen, near = metric(PSNR), metric(CHAMFER)
-            lines.append(f"camera {view}: {seen.title} **{seen.shown(figures[PSNR])} {seen.printed_unit}**")
-            lines.append(f"to measured points: **{near.shown(figures[CHAMFER])} {near.printed_unit}** ({near.title})")
-        else:
-            lines.append("behind the end of the recording")
+            lines.append(
+                f"{seen.title} **{seen.shown(found[PSNR])} {seen.printed_unit}** in camera {self.screen.view}, "
+                f"**{near.shown(found[CHAMFER])} {near.printed_unit}** to what was measured"
+            )
         self.figures.content = "  \n".join(lines)
 
-    def viewpoint(self) -> Viewpoint:
-        """Return the browser's camera."""
-        camera = self.client.camera
-        return Viewpoint(as_pose(camera.wxyz, camera.position), float(camera.fov), float(camera.aspect))
+    def _measured(self, step: int) -> dict[str, float] | None:
+        """Return the figures of a step, None while the picture of the film is not drawn."""
+        session, view = self.session, self.screen.view
+        if step > session.now.num_steps:
+            return None
+        known = session.now.figures
+        if (step, view) not in known:
+            picture = self.screen.film_picture(step)
+            if picture is None and self.screen.mode != FILM and not self._playing.is_set():
+                picture = session.render(step, self.opened.cameras[view : view + 1])[0]
+            if picture is None:
+                return None
+            known[step, view] = session.measure(step, view, self.screen.as_recorded(picture))
+        return known[step, view]
+
+    def request(self, step: int) -> Request | None:
+        """Return what to draw of a step; None where no picture is shown."""
+        return self.screen.request(step, int(self.view_tab.length.value), self.view.is_ready)
 
     def ask_picture(self) -> None:
-        """Have the browser's view rendered, where that is shown."""
-        if self.mode.value == "particles":
-            self.view.ask(None)
-            self.client.scene.set_background_image(None)
-            return
-        step = int(self.step.value)
-        states = [self.session.shown_state(step)]
-        if self.session.kept is not None:
-            states.append(self.session.shown_state(step, of_kept=True))
-        self.view.ask(Request(states, self.viewpoint(), int(self.rows.value)))
+        """Have the step shown rendered, where a picture is shown."""
+        request = self.request(int(self.step.value))
+        if request is None:
+            self.screen.clear()
+        self.view.ask(request)
 
-    def _show_picture(self, image: np.ndarray, is_full: bool) -> None:
-        if self.mode.value != "particles":
-            self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=90 if is_full else 75)
+    def _show_picture(self, request: Request, pictures: Pictures, is_full: bool) -> None:
+        if self._closed.is_set():
+            return
+        self.screen.show(request, pictures, is_full)
+        if is_full and self.screen.mode == FILM and not self.session.now.is_edited:
+            self._attempt(lambda: self._show_figures(int(self.step.value)))
 
     def look_through(self, view: int) -> None:
-        """Put the browser's camera where a recorded one is."""
+        """Put the browser's camera where a recorded one is, and show its film."""
         cameras, camera = self.opened.cameras, self.client.camera
-        self._looks_through = view
+        self.screen.view = view
         pose = cameras.cam_to_world[view].double().numpy()
-        camera.position = pose[:3, 3]
-        camera.look_at = pose[:3, 3] + pose[:3, 2] * np.linalg.norm(self.opened.target - pose[:3, 3])
-        camera.up_direction = (0.0, 0.0, 1.0)
-        camera.fov = float(2 * np.arctan(0.5 * cameras.height / cameras.intrinsics[view, 1, 1]))
+        self._told, self._arrived = pose[:3, 3], False
+        with self.client.atomic():
+            camera.position = pose[:3, 3]
+            camera.look_at = pose[:3, 3] + pose[:3, 2] * np.linalg.norm(self.opened.target - pose[:3, 3])
+            camera.up_direction = (0.0, 0.0, 1.0)
+            camera.fov = float(2 * np.arctan(0.5 * cameras.height / cameras.intrinsics[view, 1, 1]))
+
+    def _camera_moved(self) -> None:
+        distance = np.linalg.norm(np.asarray(self.client.camera.position) - self._told)
+        is_there = distance < _MOVED * np.linalg.norm(self.opened.target - self._told)
+        self._arrived |= bool(is_there)
+        if self.screen.mode == FILM and self._arrived and not is_there:
+            self.set_mode(PICTURE)  # a film is that of a recorded camera
+        elif self.screen.mode != PARTICLES:
+            self.ask_picture()  # also where the canvas has another size
+
+    def set_mode(self, mode: str) -> None:
+        """Show the film, the picture of the browser's camera, or particles."""
+        self.screen.mode = mode
+        self.view_tab.mode.value = mode
+        self.redraw()
 
     def close(self) -> None:
         """End what runs for this client."""

@@ -1,4 +1,4 @@
-"""The rendered picture of the browser's camera: coarse at once, full when the camera is still."""
+"""Pictures of the rollout: coarse at once, full when the camera is still, and then those of the steps to come."""
 
 import math
 import threading
@@ -8,13 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from vpd_lightning.geometry.cameras import pixel_rays
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.types import Cameras, Particles, Rays
+from vpd_lightning.viewer.frame_cache import FrameCache
 from vpd_lightning.viewer.session import to_uint8
+from vpd_lightning.viewer.viewpoints import Viewpoint
 
 STILL_SECONDS = 0.2
 """A camera that did not move for so long is still."""
@@ -25,56 +27,95 @@ COARSE_SECONDS = 0.12
 _MIN_ROWS, _MAX_ROWS = 24, 1024
 _BAND_SECONDS = 0.1
 
+MIN_BAND = 4096
+"""Rays of a band, or more: each call of a renderer has costs that do not grow with its rays."""
+
+
+Pictures = Sequence[UInt8[NDArray, "_ _ 3"]]
+
 
 @dataclass(frozen=True)
-class Viewpoint:
-    """A pinhole camera without a resolution: ``fov`` is vertical (radians), ``aspect`` width over height."""
+class Pane:
+    """A state to draw: step ``step`` of the rollout ``number``."""
 
-    cam_to_world: Float[NDArray, "4 4"]
-    fov: float
-    aspect: float
-
-    def cameras(self, rows: int) -> Cameras:
-        """Return the camera (axis ``view`` of 1) with square pixels and so many rows."""
-        columns = max(1, round(rows * min(max(self.aspect, 0.1), 10.0)))
-        focal = 0.5 * rows / math.tan(0.5 * self.fov)
-        intrinsics = torch.tensor([[focal, 0, columns / 2], [0, focal, rows / 2], [0, 0, 1.0]])
-        pose = torch.from_numpy(np.asarray(self.cam_to_world, dtype=np.float32))
-        return Cameras(intrinsics[None], pose[None], rows, columns)
+    number: int
+    step: int
+    state: Particles
 
 
 @dataclass(frozen=True)
 class Request:
-    """Which states to draw side by side (one, or two to compare), and from where."""
+    """Which states to draw (one, or two to compare), from where, and what to draw next where that is done.
 
-    states: Sequence[Particles]
+    ``rows`` are those of a full picture. ``film`` returns what will be asked for next, in that order.
+    """
+
+    panes: Sequence[Pane]
     viewpoint: Viewpoint
-    rows: int  # of the full picture
+    rows: int
+    film: Callable[[], Sequence["Request"]] = tuple
+
+    def shows_like(self, other: "Request | None") -> bool:
+        """Whether the pictures of both belong to the same film."""
+        return (
+            other is not None
+            and (self.rows, self.viewpoint.key) == (other.rows, other.viewpoint.key)
+            and [pane.number for pane in self.panes] == [pane.number for pane in other.panes]
+        )
 
 
 class ProgressiveView:
-    """A thread that draws what was asked for last and gives up on what is out of date.
+    """A thread that draws what was asked for last and gives up on what is out of date; full pictures are kept.
 
-    ``show`` gets each picture and whether it is the full one.
+    ``show`` gets the request, a picture for each of its panes, and whether they are full ones.
     """
 
     def __init__(
-        self, renderer: AbstractRenderer, show: Callable[[UInt8[NDArray, "height width 3"], bool], None]
+        self,
+        renderer: AbstractRenderer,
+        show: Callable[[Request, Pictures, bool], None],
+        frames: FrameCache | None = None,
     ) -> None:
         self._renderer, self._show = renderer, show
-        self._condition = threading.Condition()
+        self._frames = FrameCache() if frames is None else frames
+        self._condition, self._showing = threading.Condition(), threading.Lock()
         self._request: Request | None = None
-        self._number, self._asked_at, self._stopped = 0, 0.0, False
+        self._number, self._asked_at, self._stopped, self._film_grew = 0, 0.0, False, False
         self._pixels_per_second = 50_000.0
         self.coarse_seconds: list[float] = []  # from asking to showing, for benchmarks
         self._thread = threading.Thread(target=self._work, daemon=True, name="vpd-view rendering")
         self._thread.start()
 
     def ask(self, request: Request | None) -> None:
-        """Draw this from now on; None draws nothing."""
+        """Draw this from now on; None draws nothing. What is kept is shown before this returns."""
+        kept = None if request is None else self._kept(request)
         with self._condition:
+            goes_on = kept is not None and request is not None and request.shows_like(self._request)
             self._request, self._asked_at = request, time.perf_counter()
-            self._number += 1
+            if not goes_on:
+                self._number += 1
+            number = self._number
+            self._condition.notify()
+        if request is not None and kept is not None:
+            self._show_if_current(number, request, kept, True)
+
+    def is_ready(self, request: Request) -> bool:
+        """Whether the full pictures of a request are kept."""
+        return self._kept(request) is not None
+
+    def draw(self, request: Request) -> Pictures:
+        """Return the full pictures of a request, drawn here and now where they are not kept."""
+        kept = self._kept(request)
+        if kept is not None:
+            return kept
+        pictures = self._draw(request, request.rows, number=None, in_bands=True)
+        assert pictures is not None  # nothing makes it out of date
+        return pictures
+
+    def film_grew(self) -> None:
+        """Look again whether the film that was asked for has more steps."""
+        with self._condition:
+            self._film_grew = True
             self._condition.notify()
 
     def stop(self) -> None:
@@ -84,6 +125,16 @@ class ProgressiveView:
             self._number += 1
             self._condition.notify()
         self._thread.join(timeout=10)
+
+    def _kept(self, request: Request) -> Pictures | None:
+        found = [self._frames.get(_key(request, pane)) for pane in request.panes]
+        kept = [image for image in found if image is not None]
+        return kept if len(kept) == len(found) else None
+
+    def _show_if_current(self, number: int, request: Request, pictures: Pictures, is_full: bool) -> None:
+        with self._showing:
+            if number == self._number:
+                self._show(request, pictures, is_full)
 
     def _work(self) -> None:
         done = 0
@@ -95,19 +146,40 @@ class ProgressiveView:
                     return
                 number, request, asked = self._number, self._request, self._asked_at
             done = number
-            if request is None:
+            if request is not None and self._draw_asked(request, number, asked):
+                self._fill(number)
+
+    def _draw_asked(self, request: Request, number: int, asked: float) -> bool:
+        """Show what was asked for, coarse and then full; False where something newer was asked for in between."""
+        if self._kept(request) is not None:
+            return self._is_still(number)
+        rows = self._coarse_rows(request)
+        coarse = self._draw(request, rows, number, in_bands=False)
+        if coarse is not None:
+            self._show_if_current(number, request, coarse, rows >= request.rows)
+            self.coarse_seconds.append(time.perf_counter() - asked)
+        if not self._is_still(number):
+            return False
+        if rows < request.rows:
+            full = self._draw(request, request.rows, number, in_bands=True)
+            if full is None:
+                return False
+            self._show_if_current(number, request, full, True)
+        return True
+
+    def _fill(self, number: int) -> None:
+        """Draw the steps to come, until something else is asked for."""
+        while True:
+            with self._condition:
+                request, self._film_grew = self._request, False
+                if number != self._number or request is None:
+                    return
+            missing = next((other for other in request.film() if self._kept(other) is None), None)
+            if missing is not None:
+                self._draw(missing, missing.rows, number, in_bands=True)
                 continue
-            rows = self._coarse_rows(request)
-            coarse = self._draw(request, rows, number, in_bands=False)
-            if coarse is not None:
-                self._show(coarse, rows >= request.rows)
-                self.coarse_seconds.append(time.perf_counter() - asked)
-            if rows >= request.rows:
-                continue
-            if self._is_still(number):
-                full = self._draw(request, request.rows, number, in_bands=True)
-                if full is not None:
-                    self._show(full, True)
+            with self._condition:
+                self._condition.wait_for(lambda: self._number != number or self._film_grew)
 
     def _is_still(self, number: int) -> bool:
         """Wait; whether nothing newer was asked for."""
@@ -115,30 +187,36 @@ class ProgressiveView:
             return not self._condition.wait_for(lambda: self._number != number, timeout=STILL_SECONDS)
 
     def _coarse_rows(self, request: Request) -> int:
-        pixels = COARSE_SECONDS * self._pixels_per_second
-        rows = int(math.sqrt(pixels / max(request.viewpoint.aspect, 0.1)))
+        pixels = COARSE_SECONDS * self._pixels_per_second / len(request.panes)
+        cameras = request.viewpoint.cameras(_MIN_ROWS)
+        rows = int(math.sqrt(pixels * cameras.height / cameras.width))
         return min(max(rows, _MIN_ROWS), request.rows, _MAX_ROWS)
 
-    def _draw(
-        self, request: Request, rows: int, number: int, in_bands: bool
-    ) -> UInt8[NDArray, "height width 3"] | None:
-        """Render all states side by side; None where something newer was asked for in between."""
-        view = request.viewpoint
-        share = Viewpoint(view.cam_to_world, view.fov, view.aspect / len(request.states))
-        pictures = [self._picture(state, share.cameras(rows), number, in_bands) for state in request.states]
-        found = [picture for picture in pictures if picture is not None]
-        return np.concatenate(found, axis=1) if len(found) == len(pictures) else None
+    def _draw(self, request: Request, rows: int, number: int | None, in_bands: bool) -> Pictures | None:
+        """Render all states; None where something newer than ``number`` was asked for in between."""
+        cameras, pictures = request.viewpoint.cameras(rows), []
+        for pane in request.panes:
+            key = _key(request, pane)
+            picture = self._frames.get(key) if rows >= request.rows else None
+            if picture is None:
+                picture = self._picture(pane.state, cameras, number, in_bands)
+                if picture is None:
+                    return None
+                if rows >= request.rows:
+                    self._frames.put(key, picture)
+            pictures.append(picture)
+        return pictures
 
     @torch.no_grad()
     def _picture(
-        self, state: Particles, cameras: Cameras, number: int, in_bands: bool
+        self, state: Particles, cameras: Cameras, number: int | None, in_bands: bool
     ) -> UInt8[NDArray, "height width 3"] | None:
         rays = pixel_rays(cameras.to(state.positions.device, state.positions.dtype))
         origins, directions = rays.origins[0].flatten(0, 1), rays.directions[0].flatten(0, 1)
-        band = max(cameras.width, int(_BAND_SECONDS * self._pixels_per_second)) if in_bands else len(origins)
+        band = max(MIN_BAND, int(_BAND_SECONDS * self._pixels_per_second)) if in_bands else len(origins)
         parts = []
         for first in range(0, len(origins), band):
-            if in_bands and number != self._number:
+            if in_bands and number is not None and number != self._number:
                 return None
             piece = slice(first, first + band)
             start = time.perf_counter()
@@ -146,4 +224,8 @@ class ProgressiveView:
             parts.append(rendered.rgbs[0])
             rate = len(origins[piece]) / max(time.perf_counter() - start, 1e-6)
             self._pixels_per_second = 0.5 * self._pixels_per_second + 0.5 * rate
-        return to_uint8(torch.cat(parts).reshape(cameras.height, cameras.width, 3))
+        return np.array(to_uint8(torch.cat(parts).reshape(cameras.height, cameras.width, 3)))
+
+
+def _key(request: Request, pane: Pane) -> tuple[object, ...]:
+    return (pane.number, pane.step, request.viewpoint.key, request.rows)

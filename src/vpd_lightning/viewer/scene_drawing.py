@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import viser
 
+from vpd_lightning.viewer.panes import SELECTED
 from vpd_lightning.viewer.session import Session
 
-SELECTED = (255, 140, 0)
 _BESIDE = 1.15  # a kept scene stands so many widths of the workspace to the side
 
 
@@ -20,24 +20,24 @@ class SceneDrawing:
         opened = session.opened
         self.beside = np.array([_BESIDE * (opened.workspace_max[0] - opened.workspace_min[0]), 0.0, 0.0])
 
-    def first_particles(self, size: float) -> None:
-        """Draw the particles as they were observed, before the renderer has coloured any."""
-        current = self.session.opened.scene.current
-        there = current.mask[0].cpu().numpy()
-        points = current.positions[0].float().cpu().numpy()[there]
-        self._cloud("now", points, self.session.opened.observed_colors[there], size, True, np.zeros(3))
+    def particles(self, step: int, visible: bool, size: float, compares: bool) -> None:
+        """Draw the particles of a step, those of a kept scene beside them, and at step 0 the selection.
 
-    def particles(self, step: int, visible: bool, size: float) -> None:
-        """Draw the particles of a step, those of the kept scene beside it, and at step 0 the selection."""
+        Nothing where they are not ``visible``: their colours cost a rendering.
+        """
+        if not visible:
+            for name in ("now", "kept", "selected"):
+                self.remove(name)
+            return
         for name, of_kept in (("now", False), ("kept", True)):
-            if of_kept and self.session.kept is None:
+            if of_kept and (self.session.kept is None or not compares):
                 self.remove("kept")
                 continue
             state, colors = self.session.shown(step, of_kept)
             there = state.mask[0].cpu().numpy()
             points = state.positions[0].float().cpu().numpy()[there]
             where = self.beside if of_kept else np.zeros(3)
-            self._cloud(name, points, colors[there], size, visible, where)
+            self._cloud(name, points, colors[there], size, True, where)
         chosen = self.session.selected.cpu().numpy() if step == 0 else np.zeros(0, bool)
         if not chosen.any():
             self.remove("selected")

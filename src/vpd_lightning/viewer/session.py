@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -10,32 +9,19 @@ from jaxtyping import Bool, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vpd_lightning.editing.colored_editor import colored_editor
-from vpd_lightning.editing.operations import Operation
+from vpd_lightning.editing.operations import Operation, find
 from vpd_lightning.editing.scene_editor import SceneEditor
-from vpd_lightning.editing.selectors import Selector
+from vpd_lightning.editing.selectors import AnyOf, Cluster, Everything, Not, Selector
 from vpd_lightning.errors import EditError
 from vpd_lightning.metrics.chamfer import chamfer
 from vpd_lightning.metrics.psnr import psnr
 from vpd_lightning.metrics.registry import CHAMFER, PSNR
 from vpd_lightning.types import Cameras, Particles
+from vpd_lightning.viewer.body_names import body_names
 from vpd_lightning.viewer.opened_scene import OpenedScene
+from vpd_lightning.viewer.rollout import Rollout
 
 COMBINATIONS = ("replace", "add", "subtract", "intersect")
-
-
-@dataclass
-class Rollout:
-    """An edited scene and what became of it; ``states[0]`` is the last input frame, as edited."""
-
-    editor: SceneEditor
-    states: list[Particles]
-    colors: dict[int, UInt8[NDArray, "particle 3"]] = field(default_factory=dict)
-
-    @property
-    def num_steps(self) -> int:
-        """How many steps were simulated."""
-        return len(self.states) - 1
 
 
 class Session:
@@ -44,14 +30,31 @@ class Session:
     def __init__(self, opened: OpenedScene):
         self.opened = opened
         self.lock = threading.RLock()
-        self.now = self._fresh(colored_editor(opened.simulator, opened.scene, opened.viewpoint))
+        self.now = opened.rollout
+        self._editor = self.now.editor  # knows what was undone; that of the unedited scene is everybody's
         self.kept: Rollout | None = None
         self.selector: Selector | None = None
         self._generation = 0
+        self._labels: list[tuple[Operation, str]] = []
 
-    @staticmethod
-    def _fresh(editor: SceneEditor) -> Rollout:
-        return Rollout(editor, [editor.scene.current])
+    def _fresh(self, editor: SceneEditor) -> Rollout:
+        return Rollout(self.opened.simulator, editor) if editor.operations else self.opened.rollout
+
+    @property
+    def other(self) -> Rollout | None:
+        """What the edited scene is compared with: the kept one, or else the unedited one; None where that is it."""
+        with self.lock:
+            other = self.kept or self.opened.rollout
+            return None if other is self.now else other
+
+    def label(self, rollout: Rollout) -> str:
+        """Return what was done to a scene, in words."""
+        with self.lock:
+            done = rollout.editor.operations
+            words = [label for operation in done for known, label in self._labels if known is operation]
+        if not done:
+            return "as recorded"
+        return ", ".join(words) if len(words) == len(done) <= 2 else f"{len(done)} edits"
 
     # Selecting
 
@@ -81,11 +84,54 @@ class Session:
             labels = state.clusters[state.mask & (state.clusters >= 0)]
             return torch.bincount(labels).tolist() if len(labels) else []
 
+    def body_names(self) -> list[str]:
+        """Return what a person calls each object-like cluster, in the order of their numbers."""
+        with self.lock:
+            state = self.now.editor.state
+        clusters = torch.where(state.mask, state.clusters, -1).cpu().numpy()
+        colors = np.full((len(clusters), 3), 0.5) if state.colors is None else state.colors.float().cpu().numpy()
+        return body_names(self.opened.kind, clusters, colors)
+
+    def bodies(self) -> Selector | None:
+        """Return the selector of all object-like clusters; None where there are none."""
+        clusters = tuple(Cluster(number) for number in range(len(self.cluster_sizes())))
+        return AnyOf(clusters) if clusters else None
+
+    def surroundings(self) -> Selector:
+        """Return the selector of what is no object-like cluster: floor, walls, what stands still."""
+        bodies = self.bodies()
+        return Everything() if bodies is None else Not(bodies)
+
+    def velocity(self, selector: Selector) -> tuple[float, float, float]:
+        """Return the mean velocity (metres a step) of what is selected between the two input frames; 0 where unknown.
+
+        Raises:
+            EditError: nothing is selected.
+        """
+        with self.lock:
+            state = self.now.editor.state
+        now, before = find(state, selector)
+        if not bool(before.any()):
+            return (0.0, 0.0, 0.0)
+        previous, current = state.scene.previous.positions[0], state.scene.current.positions[0]
+        x, y, z = (current[now].mean(dim=0) - previous[before].mean(dim=0)).tolist()
+        return (x, y, z)
+
     # Editing
 
-    def apply(self, operation: Operation) -> None:
-        """Edit the scene; what was simulated of the old one is forgotten."""
-        self._edit(lambda editor: editor.apply(operation))
+    def apply(self, operation: Operation, label: str = "edited") -> None:
+        """Edit the scene; ``label`` says what was done, in words."""
+        with self.lock:
+            self._edit(lambda editor: editor.apply(operation))
+            self._labels.append((operation, label))
+
+    def start_over(self) -> None:
+        """Forget all edits, the selection and what was kept."""
+        with self.lock:
+            self.now, self.kept, self.selector = self.opened.rollout, None, None
+            self._editor = self.now.editor
+            self._labels = []
+            self._generation += 1
 
     def undo(self) -> None:
         """Take the last edit back."""
@@ -108,7 +154,8 @@ class Session:
 
     def _edit(self, act: Callable[[SceneEditor], SceneEditor]) -> None:
         with self.lock:
-            self.now = self._fresh(act(self.now.editor))
+            self._editor = act(self._editor)
+            self.now = self._fresh(self._editor)
             self.selector = None
             self._generation += 1
 
@@ -118,15 +165,11 @@ class Session:
         """Predict the next steps of the edited scene; False where an edit came in between."""
         with self.lock:
             generation, rollout = self._generation, self.now
-            scene = rollout.editor.scene
-        prediction = self.opened.simulator.start(scene)
         for step in range(1, num_steps + 1):
-            prediction = prediction.step()
+            rollout.reach(step)
             with self.lock:
                 if generation != self._generation:
                     return False
-                if step > rollout.num_steps:
-                    rollout.states.append(prediction.particles)
             if on_step is not None:
                 on_step(step)
         return True
@@ -136,7 +179,7 @@ class Session:
     def keep(self) -> None:
         """Keep the edited scene and its rollout for comparison."""
         with self.lock:
-            self.kept = Rollout(self.now.editor, list(self.now.states), dict(self.now.colors))
+            self.kept = self.now
 
     def swap(self) -> None:
         """Exchange what is edited and what is kept."""
@@ -144,6 +187,7 @@ class Session:
             if self.kept is None:
                 raise EditError("Nothing is kept for comparison.\nKeep a scene first.")
             self.now, self.kept = self.kept, self.now
+            self._editor = self.now.editor
             self.selector = None
             self._generation += 1
 
@@ -175,21 +219,29 @@ class Session:
         state = self.shown_state(step, of_kept)
         return to_uint8(self.opened.simulator.render([state], cameras)[0])
 
+    def has_truth(self, step: int) -> bool:
+        """Whether a step can be compared with the recording: nothing was edited, and the recording goes so far."""
+        with self.lock:
+            return not self.now.is_edited and step <= self.opened.num_true_steps
+
     def measure(self, step: int, view: int, image: UInt8[NDArray, "height width 3"]) -> dict[str, float]:
         """Return figures of a step: ``psnr`` (dB) of an image of a camera, ``chamfer`` (metres) to what was measured.
 
-        What lies behind the recording has no truth and gives none; an edited scene is held against the unedited truth.
+        What lies behind the recording has no truth and gives none, nor does an edited scene.
         """
-        state = self.shown_state(step)
+        with self.lock:
+            rollout, step = self._at(step, False)
+        state = rollout.states[step]
         figures = {"particles": float(state.mask.sum())}
-        if step <= self.opened.num_true_steps:
-            pair = (
-                torch.from_numpy(np.ascontiguousarray(part)).float() / 255
-                for part in (image, self.opened.truth[step, view])
-            )
-            figures[PSNR] = float(psnr(*pair))
-            points, _ = self.opened.seen_points(step)
-            figures[CHAMFER] = chamfer(state.positions[0][state.mask[0]], torch.from_numpy(points)).mean
+        if not self.has_truth(step):
+            return figures
+        pair = (
+            torch.from_numpy(np.array(part)).float() / 255  # a copy: pictures that are kept cannot be written
+            for part in (image, self.opened.truth[step, view])
+        )
+        figures[PSNR] = float(psnr(*pair))
+        points, _ = self.opened.seen_points(step)
+        figures[CHAMFER] = chamfer(state.positions[0][state.mask[0]], torch.from_numpy(points)).mean
         return figures
 
     def operations(self) -> Sequence[Operation]:

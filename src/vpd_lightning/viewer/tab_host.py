@@ -8,7 +8,8 @@ import viser
 
 from vpd_lightning.viewer.exports import ExportFolder
 from vpd_lightning.viewer.opened_scene import OpenedScene
-from vpd_lightning.viewer.progressive_view import Viewpoint
+from vpd_lightning.viewer.progressive_view import ProgressiveView, Request
+from vpd_lightning.viewer.screen import Screen
 from vpd_lightning.viewer.session import Session
 
 
@@ -19,11 +20,11 @@ class TabHost(ABC):
     opened: OpenedScene
     folder: ExportFolder
     session: Session
-    # Handles of viser's inputs; a tab reads or sets their ``value``.
+    screen: Screen
+    view: ProgressiveView
+    # Handle of viser's slider, whose ``value`` is the step shown, and the tab that says what is shown.
     step: Any
-    fps: Any
-    rows: Any
-    point_size: Any
+    view_tab: Any
 
     @abstractmethod
     def act(self, action: Callable[[], Any]) -> None:
@@ -34,13 +35,33 @@ class TabHost(ABC):
         """Show a message in the browser."""
 
     @abstractmethod
-    def edited(self) -> None:
-        """Show a scene that was just edited."""
+    def edit(self, action: Callable[[], Any]) -> None:
+        """Edit the scene, and show what becomes of it."""
+
+    @abstractmethod
+    def go_to(self, step: int) -> None:
+        """Show a step."""
+
+    @abstractmethod
+    def set_playing(self, plays: bool) -> None:
+        """Let the film run, or stop it where it is."""
+
+    @abstractmethod
+    def set_mode(self, mode: str) -> None:
+        """Show the film, the picture of the browser's camera, or particles."""
+
+    @abstractmethod
+    def simulate_again(self) -> None:
+        """Simulate in the background, unless that goes on already."""
+
+    @abstractmethod
+    def look_through(self, view: int) -> None:
+        """Put the browser's camera where a recorded one is, and show its film."""
+
+    @abstractmethod
+    def request(self, step: int) -> Request | None:
+        """Return what to draw of a step; None where no picture is shown."""
 
     @abstractmethod
     def redraw(self) -> None:
         """Draw the current step."""
-
-    @abstractmethod
-    def viewpoint(self) -> Viewpoint:
-        """Return the browser's camera."""

@@ -1,0 +1,48 @@
+"""An edited scene and what becomes of it, simulated once for all who look at it."""
+
+import itertools
+import threading
+
+from jaxtyping import UInt8
+from numpy.typing import NDArray
+
+from vpd_lightning.editing.scene_editor import SceneEditor
+from vpd_lightning.simulator import Rollout as SimulatedRollout
+from vpd_lightning.simulator import Simulator
+from vpd_lightning.types import Particles
+
+_numbers = itertools.count()
+
+
+class Rollout:
+    """``states[0]`` is the last input frame, as edited; later ones are there as far as ``reach`` was called.
+
+    ``number`` is unlike that of every other rollout. Methods may be called from any thread.
+    """
+
+    def __init__(self, simulator: Simulator, editor: SceneEditor):
+        self.simulator, self.editor = simulator, editor
+        self.states: list[Particles] = [editor.scene.current]
+        self.colors: dict[int, UInt8[NDArray, "particle 3"]] = {}
+        self.figures: dict[tuple[int, int], dict[str, float]] = {}  # by step and recorded camera
+        self.number = next(_numbers)
+        self._last: SimulatedRollout | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def num_steps(self) -> int:
+        """How many steps were simulated."""
+        return len(self.states) - 1
+
+    @property
+    def is_edited(self) -> bool:
+        """Whether anything was edited."""
+        return bool(self.editor.operations)
+
+    def reach(self, step: int) -> None:
+        """Simulate as far as ``step``; what was simulated before is not simulated again."""
+        with self._lock:
+            while self.num_steps < step:
+                last = self._last or self.simulator.start(self.editor.scene)
+                self._last = last.step()
+                self.states.append(self._last.particles)
