@@ -55,12 +55,20 @@ class Request:
     rows: int
     film: Callable[[], Sequence["Request"]] = tuple
 
+    def shows_same_scenes(self, other: "Request | None") -> bool:
+        """Whether both draw the same rollouts by the same kind of camera, which may have moved."""
+        return (
+            other is not None
+            and type(self.viewpoint) is type(other.viewpoint)
+            and [pane.number for pane in self.panes] == [pane.number for pane in other.panes]
+        )
+
     def shows_like(self, other: "Request | None") -> bool:
         """Whether the pictures of both belong to the same film."""
         return (
             other is not None
+            and self.shows_same_scenes(other)
             and (self.rows, self.viewpoint.key) == (other.rows, other.viewpoint.key)
-            and [pane.number for pane in self.panes] == [pane.number for pane in other.panes]
         )
 
 
@@ -133,7 +141,8 @@ class ProgressiveView:
 
     def _show_if_current(self, number: int, request: Request, pictures: Pictures, is_full: bool) -> None:
         with self._showing:
-            if number == self._number:
+            # While a camera moves, the picture of a moment ago is better than none.
+            if number == self._number or (not is_full and request.shows_same_scenes(self._request)):
                 self._show(request, pictures, is_full)
 
     def _work(self) -> None:
