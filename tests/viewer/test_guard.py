@@ -1,5 +1,6 @@
 """Who may talk to the viewer, and what strangers' messages do to it."""
 
+import gzip
 import http.client
 import socket
 import threading
@@ -38,7 +39,7 @@ def viewer(tmp_path_factory: pytest.TempPathFactory):
 
 def ask(viewer: Viewer, path: str, **headers: str) -> http.client.HTTPResponse:
     connection = http.client.HTTPConnection("127.0.0.1", viewer.port, timeout=HANG)
-    connection.putrequest("GET", path, skip_host="Host" in headers)
+    connection.putrequest("GET", path, skip_host="Host" in headers, skip_accept_encoding="Accept-Encoding" in headers)
     for name, value in headers.items():
         connection.putheader(name, value)
     connection.endheaders()
@@ -104,6 +105,14 @@ def test_the_socket_needs_the_token_and_our_own_page(viewer: Viewer) -> None:
 def test_no_file_outside_of_the_page_is_served(viewer: Viewer, path: str) -> None:
     answer = ask(viewer, f"{path}?token={TOKEN}")
     assert answer.status != 200 and b"root:" not in answer.read()
+
+
+def test_arrow_keys_are_taken_from_the_camera_in_every_encoding_of_the_page(viewer: Viewer) -> None:
+    plain, packed = ask(viewer, f"/?token={TOKEN}"), ask(viewer, f"/?token={TOKEN}", **{"Accept-Encoding": "gzip"})
+    page, compressed = plain.read(), packed.read()
+    assert packed.getheader("Content-Encoding") == "gzip" and gzip.decompress(compressed) == page
+    assert page.count(b'event.code.startsWith("Arrow")') == 1
+    assert b"<script" not in ask(viewer, f"/nothing?token={TOKEN}").read()
 
 
 def test_a_taken_port_is_refused_by_name(viewer: Viewer) -> None:
@@ -219,7 +228,10 @@ def test_ten_thousand_random_messages_leave_the_server_alive_and_other_clients_u
                 connections += 1
                 connection.send(camera_message())
                 drain(connection)
-                targets = list(settled_panel(viewer, known).client.gui._gui_input_handle_from_uuid)
+                gui = settled_panel(viewer, known).client.gui
+                inputs = list(gui._gui_input_handle_from_uuid)
+                targets = [*(4 * inputs), *gui._command_handle_from_uuid]  # keys are slower to answer
+                assert inputs and len(targets) > 4 * len(inputs)
                 try:
                     for message in junk_messages(targets, 1500, connections):
                         connection.send(message)

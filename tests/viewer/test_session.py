@@ -27,8 +27,8 @@ from vpd_lightning.media.camera_paths import read_camera_file
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.viewer import progressive_view
 from vpd_lightning.viewer.exports import ExportFolder
-from vpd_lightning.viewer.opened_scene import OpenedScene
 from vpd_lightning.viewer.frame_cache import FrameCache
+from vpd_lightning.viewer.opened_scene import OpenedScene
 from vpd_lightning.viewer.progressive_view import Pane, Pictures, ProgressiveView, Request
 from vpd_lightning.viewer.session import Session
 from vpd_lightning.viewer.viewpoints import FreeViewpoint, RecordedViewpoint

@@ -51,7 +51,7 @@ class BodyHandles:
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
-        selector, chosen = self.session.selector, self.session.selected
+        body, chosen = self.session.selected_body, self.session.selected
         if not bool(chosen.any()):
             return
         points = self._points(chosen.cpu().numpy())
@@ -60,8 +60,7 @@ class BodyHandles:
         self._gizmo = self.panel.client.scene.add_transform_controls(
             "/gizmo", scale=0.7 * size, depth_test=False, position=center, visible=self._visible
         )
-        is_body = isinstance(selector, Cluster) and selector.number < len(self._hulls)
-        hull = self._hulls[selector.number] if is_body else None  # type: ignore[union-attr]
+        hull = self._hulls[body] if body is not None and body < len(self._hulls) else None
 
         async def turned(event: Any) -> None:
             gizmo = event.target

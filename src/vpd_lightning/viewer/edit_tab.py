@@ -64,19 +64,16 @@ class EditTab:
         self.handles.make()
 
     def _show_selection(self) -> None:
-        selector, count = self.session.selector, int(self.session.selected.sum())
-        is_body = isinstance(selector, Cluster) and selector.number + 1 < len(self.clusters.options)
-        self.clusters.value = self.clusters.options[selector.number + 1 if is_body else 0]  # type: ignore[union-attr]
+        body, count = self.session.selected_body, int(self.session.selected.sum())
+        self.clusters.value = self.clusters.options[0 if body is None else body + 1]
         what = f"**{self._name()}** is selected: {count} particles" if count else "Click a body to select it."
         self.status.content = what + ("  \nDrag a rectangle around what to select." if self._armed else "")
         self.handles.show_selected()
 
     def _name(self) -> str:
         """Return what is selected, in words."""
-        selector, names = self.session.selector, self.session.body_names()
-        if isinstance(selector, Cluster) and selector.number < len(names):
-            return f"the {names[selector.number]}"
-        return "the selection"
+        body = self.session.selected_body
+        return "the selection" if body is None else f"the {self.session.body_names()[body]}"
 
     def _select(self, selector: Selector | None) -> None:
         self.session.select(selector, self.how.value)
@@ -189,9 +186,7 @@ class EditTab:
             path = Path(folder) / "edit.yaml"
             path.write_bytes(self.upload.value.content)
             operations = load_edit(path)
-        for operation in operations:
-            self.session.apply(operation)
-        self.panel.edited()
+        self.panel.edit(lambda: self.session.apply_all(operations))
 
     def show_handles(self, visible: bool) -> None:
         """Let bodies be dragged: an edit is of the last input frame, and not of what is predicted."""

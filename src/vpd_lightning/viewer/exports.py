@@ -12,8 +12,8 @@ from vpd_lightning.editing.operations import Operation
 from vpd_lightning.errors import EditError
 from vpd_lightning.media.nerfstudio_paths import write_camera_path
 from vpd_lightning.media.particle_files import write_glb, write_particles
-from vpd_lightning.media.ply import write_ply
 from vpd_lightning.media.pictures import write_png
+from vpd_lightning.media.ply import write_ply
 from vpd_lightning.media.video import FILM_FORMATS, write_video
 from vpd_lightning.types import Cameras, Particles
 

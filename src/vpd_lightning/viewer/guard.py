@@ -23,6 +23,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from vpd_lightning.errors import ConfigError
+from vpd_lightning.viewer.page_script import add_script
 
 HOST = "127.0.0.1"
 LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
@@ -125,6 +126,7 @@ def _guarded(inner: Callable[..., Response | None], token: str) -> Callable[...,
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, text)
         response = inner(connection, request)
         if response is not None:
+            add_script(response)
             response.headers["Set-Cookie"] = f"{_COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict"
             response.headers["X-Frame-Options"] = "DENY"
             response.headers["Referrer-Policy"] = "no-referrer"

@@ -27,7 +27,6 @@ _MOVED = 0.001
 
 _POLL_SECONDS = 0.02
 
-
 class Panel(TabHost):
     """Connects a browser with a session; every client has its own, so that nothing is shared but the model.
 
@@ -51,7 +50,7 @@ class Panel(TabHost):
         self.view = ProgressiveView(opened.simulator.renderer, self._show_picture, opened.frames)
         self.touched_at = time.monotonic()
         self._playing, self._closed = threading.Event(), threading.Event()
-        self._busy = threading.Lock()
+        self._busy, self._stepping = threading.Lock(), threading.RLock()
         self._told, self._arrived = np.zeros(3), False  # where the browser's camera was put, and whether it went there
         gui: Any = client.gui
         self.look_through(self.screen.view)
@@ -98,7 +97,10 @@ class Panel(TabHost):
         )
         for label, hotkey, modifier, action in keys:
             command = self.client.gui.add_command(label, hotkey=hotkey, modifier=modifier)  # type: ignore[arg-type]
-            command.on_trigger(lambda _, action=action: self.act(action))
+            command.on_trigger(self._acting(action))
+
+    def _acting(self, action: Callable[[], Any]) -> Callable[[Any], None]:
+        return lambda _: self.act(action)
 
     # What happens
 
@@ -209,10 +211,11 @@ class Panel(TabHost):
 
     def set_playing(self, plays: bool) -> None:
         """Let the film run, or stop it where it is."""
-        if plays:
-            self._playing.set()
-        else:
-            self._playing.clear()
+        with self._stepping:  # not while the film goes on to its next step
+            if plays:
+                self._playing.set()
+            else:
+                self._playing.clear()
         self.play.label = "Pause" if plays else "Play"
         self.play.icon = "player-pause" if plays else "player-play"
         if not plays:
@@ -248,7 +251,9 @@ class Panel(TabHost):
         if following == int(self.step.value) or (request is not None and not self.view.is_ready(request)):
             self._closed.wait(_POLL_SECONDS)
             return
-        self.go_to(following)
+        with self._stepping:
+            if self._playing.is_set():
+                self.go_to(following)
         self._closed.wait(1.0 / self.view_tab.fps.value)
 
     # What is shown

@@ -102,10 +102,9 @@ class ProgressiveView:
             self._request, self._asked_at = request, time.perf_counter()
             if not goes_on:
                 self._number += 1
-            number = self._number
             self._condition.notify()
         if request is not None and kept is not None:
-            self._show_if_current(number, request, kept, True)
+            self._show_if_current(request, kept, True)
 
     def is_ready(self, request: Request) -> bool:
         """Whether the full pictures of a request are kept."""
@@ -139,10 +138,12 @@ class ProgressiveView:
         kept = [image for image in found if image is not None]
         return kept if len(kept) == len(found) else None
 
-    def _show_if_current(self, number: int, request: Request, pictures: Pictures, is_full: bool) -> None:
+    def _show_if_current(self, request: Request, pictures: Pictures, is_full: bool) -> None:
         with self._showing:
+            latest = self._request
             # While a camera moves, the picture of a moment ago is better than none.
-            if number == self._number or (not is_full and request.shows_same_scenes(self._request)):
+            serves = not is_full and latest is not None and self._kept(latest) is None
+            if request is latest or (serves and request.shows_same_scenes(latest)):
                 self._show(request, pictures, is_full)
 
     def _work(self) -> None:
@@ -165,7 +166,7 @@ class ProgressiveView:
         rows = self._coarse_rows(request)
         coarse = self._draw(request, rows, number, in_bands=False)
         if coarse is not None:
-            self._show_if_current(number, request, coarse, rows >= request.rows)
+            self._show_if_current(request, coarse, rows >= request.rows)
             self.coarse_seconds.append(time.perf_counter() - asked)
         if not self._is_still(number):
             return False
@@ -173,7 +174,7 @@ class ProgressiveView:
             full = self._draw(request, request.rows, number, in_bands=True)
             if full is None:
                 return False
-            self._show_if_current(number, request, full, True)
+            self._show_if_current(request, full, True)
         return True
 
     def _fill(self, number: int) -> None:

@@ -92,6 +92,13 @@ class Session:
         colors = np.full((len(clusters), 3), 0.5) if state.colors is None else state.colors.float().cpu().numpy()
         return body_names(self.opened.kind, clusters, colors)
 
+    @property
+    def selected_body(self) -> int | None:
+        """The number of the object-like cluster that is selected; None where something else is, or nothing."""
+        with self.lock:
+            index = self.selector.index if isinstance(self.selector, Cluster) else None
+            return index if isinstance(index, int) and index < len(self.cluster_sizes()) else None
+
     def bodies(self) -> Selector | None:
         """Return the selector of all object-like clusters; None where there are none."""
         clusters = tuple(Cluster(number) for number in range(len(self.cluster_sizes())))
@@ -124,6 +131,14 @@ class Session:
         with self.lock:
             self._edit(lambda editor: editor.apply(operation))
             self._labels.append((operation, label))
+
+    def apply_all(self, operations: Sequence[Operation]) -> None:
+        """Make several edits, or none where one of them is refused."""
+        with self.lock:
+            editor = self._editor
+            for operation in operations:
+                editor = editor.apply(operation)
+            self._edit(lambda _: editor)
 
     def start_over(self) -> None:
         """Forget all edits, the selection and what was kept."""
