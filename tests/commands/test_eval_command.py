@@ -55,6 +55,8 @@ def test_an_evaluation_writes_everything_and_prints_its_path_last(
     shown = re.findall(r'src="([^"]+)"', page)
     assert {"curves.png", "contact_sheet.png"} < set(shown) and any(name.endswith(".webm") for name in shown)
     assert all((folder / name).is_file() for name in shown) and "://" not in page
+    assert page.index("<video") < page.index("last frame repeated") < page.index("curves.png")
+    assert page.count("autoplay loop muted") == page.count("<video") >= 1
     metrics = json.loads((folder / "metrics.json").read_text())
     assert f"{metrics['psnr']['per_step'][2]:.4g}" in page and "moving pixels (dB)" in page
     assert metrics["step"] == 7 and len(metrics["checkpoint_sha256"]) == len(metrics["data_sha256"]) == 64

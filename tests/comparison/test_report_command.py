@@ -14,6 +14,7 @@ from tests.comparison.made_runs import write_rollouts, write_run
 from vpd_lightning.commands.report import main
 from vpd_lightning.comparison import comparison_video as films
 from vpd_lightning.comparison.rollout_grid import strip_steps
+from vpd_lightning.comparison.web_page import web_page
 from vpd_lightning.errors import ConfigError
 
 
@@ -48,6 +49,22 @@ def test_the_report_prints_what_the_evaluations_say(runs: Path):
     assert len(pictures) >= 6 and all((out / name).stat().st_size > 1000 for name in pictures)
     assert {path.name for path in out.iterdir() if path.suffix in (".png", ".webm")} == set(pictures)
     assert not list(runs.glob(".report*"))
+
+
+def test_the_page_shows_films_first_and_all_that_the_report_says(runs: Path):
+    folder = runs / "report"
+    page, text = (folder / "index.html").read_text(), (folder / "report.md").read_text()
+    assert "<h1>A trial</h1>" in page and page.index("<video") < page.index("How to read the tables")
+    shown = re.findall(r'src="([^"]+)"', page)
+    assert set(shown) == set(re.findall(r"\]\((.*?)\)", text)) and all((folder / name).is_file() for name in shown)
+    assert page.count("<table>") == len(re.findall(r"^\|[-| :]+\|$", text, re.MULTILINE)) > 2
+    assert "://" not in page
+
+
+def test_names_from_outside_are_text_in_the_page():
+    page = web_page("<b>x", "# t\n\n<script>alert(1)</script>\n\na <i>name</i>, `<u>`\n", [Path("film_<s>.webm")])
+    for tag in ("<script", "<b>", "<i>", "<u>", "<s>"):
+        assert tag not in page
 
 
 def test_the_spreadsheet_has_a_row_per_run(runs: Path):

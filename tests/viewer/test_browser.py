@@ -19,6 +19,7 @@ from playwright.sync_api import Page, sync_playwright
 import vpd_lightning as vpd
 from tests.editing.scenes import same
 from tests.released_demo import demo_model, make_demo_data
+from tests.waiting import HANG
 from vpd_lightning.editing.edit_files import load_edit, replay
 from vpd_lightning.editing.operations import Move
 from vpd_lightning.editing.selectors import Cluster

@@ -13,7 +13,7 @@ The particles of the edited body are selected by the true surface, as a person w
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.results_files import versions
-from data_gen.deformable.drop import Drop, draw_drop
-from data_gen.deformable.scene import prepare
+from data_gen.counterfactual import Change
+from data_gen.deformable.counterfactual import Counterfactual, at_frame
 from data_gen.deformable.settings import DeformableSettings
 from data_gen.settings import load_settings
 from vpd_lightning.data.clip import Clip, read_clip
@@ -44,7 +44,6 @@ MARGIN = 0.1  # metres; bodies are drawn 2 cm outside of their mesh
 ASIDE = 4.0  # metres, twice the size of a body
 TOUCH = 0.1  # metres between two bodies that are about to touch
 NUM_SURFACE_POINTS = 2000
-MAX_STATE_ERROR = 1e-4  # metres; recordings hold float32
 
 
 @dataclass(frozen=True)
@@ -61,39 +60,6 @@ class Edited:
     truth_changed_by: float  # Chamfer of MuJoCo without the edit to MuJoCo with it
     last_edited: float
     last_unedited: float
-
-
-class Counterfactual:
-    """MuJoCo from the true state of a frame on, with one body gone or elsewhere."""
-
-    def __init__(self, settings: DeformableSettings, drop: Drop, frame: int):
-        import mujoco
-
-        self.settings, self.drop, self.frame = settings, drop, frame
-        model, data, self.bodies = prepare(settings, drop)
-        for _ in range(frame):
-            mujoco.mj_step(model, data, settings.substeps)
-        mujoco.mj_forward(model, data)
-        self.positions = self.bodies.rest + data.qpos.reshape(-1, 3)
-        self.velocities = data.qvel.reshape(-1, 3).copy()
-
-    def run(
-        self, kept: Sequence[int], shift: dict[int, NDArray[np.float64]], num_steps: int
-    ) -> list[NDArray[np.float64]]:
-        """Return the vertices (step, vertex, 3) of each kept body over ``num_steps`` frames behind the first."""
-        import mujoco
-
-        drop = Drop(*(tuple(getattr(self.drop, item.name)[body] for body in kept) for item in fields(Drop)))
-        model, data, bodies = prepare(self.settings, drop)
-        parts = [self.bodies.parts[body] for body in kept]
-        places = [self.positions[part] + shift.get(body, 0.0) for body, part in zip(kept, parts, strict=True)]
-        data.qpos[:] = (np.concatenate(places) - bodies.rest).ravel()
-        data.qvel[:] = np.concatenate([self.velocities[part] for part in parts]).ravel()
-        frames = []
-        for _ in range(num_steps):
-            mujoco.mj_step(model, data, self.settings.substeps)
-            frames.append(bodies.rest + data.qpos.reshape(-1, 3))
-        return [np.stack([points[part] for points in frames]) for part in bodies.parts]
 
 
 def surface_points(
@@ -134,9 +100,9 @@ def judge(
     scene = encode_clip(simulator, clip, list(views))
     lower, upper = 0, 1  # a drop lists the lowest body first
     shift = None if edit == "delete" else torch.tensor([ASIDE, 0.0, 0.0])
-    kept = [lower] if edit == "delete" else [lower, upper]
-    counterfactual = truth.run(kept, {} if shift is None else {upper: shift.numpy()}, num_steps)[0]
-    factual = truth.run([lower, upper], {}, num_steps)[0]
+    change = Change(is_gone=True) if shift is None else Change(shift=shift.tolist())
+    counterfactual = truth.run({upper: change}, num_steps)[0]
+    factual = truth.run({}, num_steps)[0]
     tetrahedra = truth.drop.meshes[lower].tetrahedra
     target, unchanged = (surface_points(v, tetrahedra, clip.trajectory) for v in (counterfactual, factual))
 
@@ -174,23 +140,6 @@ def start_before_touch(path: Path) -> int | None:
         if nearest_on_surface(lower, vertices[upper]).distance.min() < TOUCH:
             return max(frame - 2, 0) if frame >= 2 else None
     return None
-
-
-def truth_of(clip: Clip, settings: DeformableSettings, attributes: dict[str, Any]) -> Counterfactual:
-    """Return MuJoCo at the last input frame of a generated trajectory.
-
-    Raises:
-        RuntimeError: the simulation does not repeat the recording: other versions, or another machine.
-    """
-    drop = draw_drop(
-        settings, int(attributes["seed"]), attributes["split"], int(attributes["index"]), int(attributes["attempt"])
-    )
-    truth = Counterfactual(settings, drop, clip.current_frame)
-    assert clip.state is not None and clip.state.vertices is not None
-    error = float(np.abs(truth.positions - clip.state.vertices[clip.current_frame]).max())
-    if error > MAX_STATE_ERROR:
-        raise RuntimeError(f"the simulation is {error:.2g} m off the recording; generate the data set on this machine")
-    return truth
 
 
 def draw(simulator: Simulator, clip: Clip, parts: dict[str, Any], steps: Sequence[int], path: Path) -> None:
@@ -242,7 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(f"{number:3d} left out: the bodies touch too late, too early or never")
             continue
         clip = read_clip(path, number, start, options.steps)
-        truth = truth_of(clip, settings, _attributes(path))
+        truth = at_frame(settings, _attributes(path), path, clip.current_frame)
         for edit in ("delete", "move"):
             row, parts = judge(simulator, clip, views, truth, edit, options.steps)
             rows.append(row)

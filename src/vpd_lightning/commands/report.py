@@ -13,6 +13,7 @@ HELP = """vpd-report: tables, plots, strips and films of rollouts over evaluated
   vpd-report FOLDER... [out=FOLDER] [title=TEXT] [split=test]
       Finds all run folders below FOLDER... that vpd-eval has evaluated, brings together what can be compared (same
       experiment, same data, same protocol), averages seeds, and writes
+        index.html          all of it in a browser, films first
         report.md           tables: systems and references, overview, who is best, paired differences, settings;
                             warnings about what the rows of a table do not share
         report.csv          one row per run: all means, intervals and settings

@@ -13,12 +13,16 @@ from vpd_lightning.comparison.rollout_grid import write_strips
 from vpd_lightning.comparison.spreadsheet import write_spreadsheet
 from vpd_lightning.comparison.sweep import sweeps_of
 from vpd_lightning.comparison.warnings import parted_experiments, table_warnings
+from vpd_lightning.comparison.web_page import web_page
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.files import AtomicPath
 
 
 def write_report(folder: Path, collection: Collection, title: str) -> list[str]:
-    """Write ``report.md``, ``report.csv``, plots, strips, films into an existing ``folder``; returns the warnings."""
+    """Write ``index.html``, ``report.md``, ``report.csv``, plots, strips, films into a ``folder`` that exists.
+
+    Returns the warnings.
+    """
     tables = comparison_tables(collection.runs)
     files = [_pictures(folder, table) for table in tables]
     overview = folder / "rollouts.png"
@@ -27,6 +31,8 @@ def write_report(folder: Path, collection: Collection, title: str) -> list[str]:
     write_spreadsheet(folder / "report.csv", tables)
     with AtomicPath(folder / "report.md") as partial:
         partial.write_text(text, encoding="utf-8")
+    with AtomicPath(folder / "index.html") as partial:
+        partial.write_text(web_page(title, text, [path for own in files for path in own.films]), encoding="utf-8")
     return parted_experiments(tables) + [
         f"{table.title}: {words}" for table in tables for words in table_warnings(table)
     ]

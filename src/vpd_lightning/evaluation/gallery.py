@@ -17,10 +17,14 @@ from vpd_lightning.media.video import comparison_frames, write_video
 _MAX_COLUMNS = 6
 _MAX_SHEET_CLIPS = 3
 _SLOW_MOTION = 0.5
+_MIN_SECONDS = 3.0
 
 
 def write_gallery(folder: Path, metrics: Mapping[str, Any], evaluation: Evaluation, num_videos: int) -> None:
-    """Write ``curves.png``, ``contact_sheet.png`` and ``videos/*.webm`` (at half speed) into ``folder``."""
+    """Write ``curves.png``, ``contact_sheet.png`` and ``videos/*.webm`` into ``folder``.
+
+    Films run at half speed, or slower where they would end within three seconds.
+    """
     write_curves(folder / "curves.png", step_table(metrics))
     views = evaluation.shown_views
     if evaluation.kept:
@@ -31,7 +35,11 @@ def write_gallery(folder: Path, metrics: Mapping[str, Any], evaluation: Evaluati
         truth, pred = with_last_input(clip, prediction)
         labels = [f"step {step}" for step in range(len(truth))]
         frames = comparison_frames(truth, pred, views, labels)
-        write_video(folder / "videos" / f"{clip_file_name(clip)}.webm", frames, _SLOW_MOTION / clip.frame_time)
+        write_video(
+            folder / "videos" / f"{clip_file_name(clip)}.webm",
+            frames,
+            min(_SLOW_MOTION / clip.frame_time, len(frames) / _MIN_SECONDS),
+        )
 
 
 def with_last_input(clip: Clip, prediction: Prediction) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

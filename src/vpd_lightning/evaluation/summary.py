@@ -23,7 +23,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
         f"{protocol['split']}: {protocol['num_trajectories']} trajectories, {protocol['num_clips']} clips, "
         f"{protocol['num_steps']} steps, {protocol['num_views']} views"
         + ("" if metrics["finite"] else "  (NOT FINITE: some predictions are NaN or infinite)"),
-        *_seen_lines(metrics),
+        *seen_lines(metrics),
         "",
         *_image_lines(metrics),
         *_unmeasured_lines(metrics),
@@ -38,7 +38,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _seen_lines(metrics: Mapping[str, Any]) -> list[str]:
+def seen_lines(metrics: Mapping[str, Any]) -> list[str]:
     """Say whether a training saw what is evaluated, where it did, or where nobody knows."""
     seen = metrics.get("seen_in_training") or {"trajectories": None}
     if seen["trajectories"] is None:
@@ -113,10 +113,10 @@ def _image_line(info: MetricInfo, width: int, metrics: Mapping[str, Any]) -> str
     model = metrics[info.name]["mean"]
     references = [metrics["references"][source][info.name]["mean"] for source in REFERENCES]
     copy, mean = (info.shown(value) for value in references)
-    return f"{info.label:{width}}{info.shown(model):>9}{copy:>11}{mean:>12}{_gain(info, model, references)}"
+    return f"{info.label:{width}}{info.shown(model):>9}{copy:>11}{mean:>12}{gain(info, model, references)}"
 
 
-def _gain(info: MetricInfo, model: float | None, references: Sequence[float | None]) -> str:
+def gain(info: MetricInfo, model: float | None, references: Sequence[float | None]) -> str:
     """By how much the model is better than the better reference; nothing where no distance says so."""
     known = [value for value in references if value is not None]
     if not info.is_score:
@@ -129,13 +129,13 @@ def _gain(info: MetricInfo, model: float | None, references: Sequence[float | No
 
 def _motion_lines(motion: Mapping[str, Any], num_steps: int) -> list[str]:
     steps = horizons(num_steps)
-    rows = [row for info in motion_metrics() if info.in_summary for row in _motion_rows(info, motion)]
+    rows = [row for info in motion_metrics() if info.in_summary for row in motion_rows(info, motion)]
     width = _label_width(label for label, _ in rows)
     lines = [f"{'after step':{width}}" + "".join(f"{step:>9}" for step in steps)]
     return lines + [f"{label:{width}}" + "".join(f"{cells[step - 1]:>9}" for step in steps) for label, cells in rows]
 
 
-def _motion_rows(info: MetricInfo, motion: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
+def motion_rows(info: MetricInfo, motion: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
     """A metric by step, those of its references indented, and behind them the ratio to one that sees no input."""
     if not motion[info.name]["count"]:  # rigid or soft bodies alone have some of them
         return []

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vpd_lightning.data.clip import read_clip
+from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.editing.colored_editor import colored_editor
 from vpd_lightning.evaluation.prediction import encode_clip
@@ -43,6 +44,7 @@ class OpenedScene:
     title: str
     kind: str  # of the data set: the name of the generated scene, "imported", ...
     rollout: Rollout  # of the scene as recorded; grows while it is simulated
+    manifest: Manifest | None = None  # of the data set, where it is known
     frames: FrameCache = field(default_factory=FrameCache)
 
     @cached_property
@@ -97,9 +99,17 @@ class OpenedScene:
 
 
 def open_scene(
-    simulator: Simulator, path: Path, start: int, input_views: Sequence[int], title: str, kind: str = ""
+    simulator: Simulator,
+    path: Path,
+    start: int,
+    input_views: Sequence[int],
+    title: str,
+    kind: str = "",
+    manifest: Manifest | None = None,
 ) -> OpenedScene:
     """Read a recording and encode the frames ``start`` and ``start + 1``; ``kind`` is the scene of its data set.
+
+    With the ``manifest`` of the data set, edits can be held against the generator's own simulation.
 
     Raises:
         DataError: the recording lacks them.
@@ -115,5 +125,5 @@ def open_scene(
     viewpoint = cameras.cam_to_world[list(input_views), :3, 3].mean(dim=0)
     return OpenedScene(
         simulator, scene, cameras, truth, tuple(input_views), low, high, path, start, title, kind,
-        Rollout(simulator, colored_editor(simulator, scene, viewpoint)),
+        Rollout(simulator, colored_editor(simulator, scene, viewpoint)), manifest,
     )  # fmt: skip

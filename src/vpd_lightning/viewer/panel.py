@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from vpd_lightning.errors import VPDError
-from vpd_lightning.metrics.registry import CHAMFER, PSNR, metric
+from vpd_lightning.viewer.captions import figures, sentence
 from vpd_lightning.viewer.edit_tab import EditTab
 from vpd_lightning.viewer.export_tab import ExportTab
 from vpd_lightning.viewer.exports import ExportFolder
@@ -26,6 +26,7 @@ _MOVED = 0.001
 """A camera that moved by this share of its distance to what it looks at was moved by hand."""
 
 _POLL_SECONDS = 0.02
+
 
 class Panel(TabHost):
     """Connects a browser with a session; every client has its own, so that nothing is shared but the model.
@@ -50,7 +51,7 @@ class Panel(TabHost):
         self.view = ProgressiveView(opened.simulator.renderer, self._show_picture, opened.frames)
         self.touched_at = time.monotonic()
         self._playing, self._closed = threading.Event(), threading.Event()
-        self._busy, self._stepping = threading.Lock(), threading.RLock()
+        self._busy, self._truth_busy, self._stepping = threading.Lock(), threading.Lock(), threading.RLock()
         self._told, self._arrived = np.zeros(3), False  # where the browser's camera was put, and whether it went there
         gui: Any = client.gui
         self.look_through(self.screen.view)
@@ -164,7 +165,29 @@ class Panel(TabHost):
         self.presets.refresh()
         self.go_to(0)
         self.simulate_again()
+        self.simulate_truth_again()
         self.set_playing(True)
+
+    def simulate_truth_again(self) -> None:
+        """Have the generator's own simulation make the same edits, in the background, where it can."""
+        if self.screen.shows_true and self.view_tab.can_simulate and self.session.now.is_edited:
+            threading.Thread(target=self._simulate_truth, daemon=True, name="vpd-view MuJoCo").start()
+
+    def _simulate_truth(self) -> None:
+        from vpd_lightning.viewer.counterfactual import counterfactual
+
+        with self._truth_busy:
+            rollout = self.session.now
+            if rollout.true_pictures is not None or not rollout.is_edited or self._closed.is_set():
+                return
+            operations, wanted = rollout.editor.operations, int(self.view_tab.length.value)
+
+            def simulate() -> None:
+                rollout.true_pictures = counterfactual(self.opened, operations, wanted)
+
+            self._attempt(simulate)
+        if rollout is self.session.now and rollout.true_pictures is not None:
+            self.redraw()
 
     def select_body(self, cluster: int | None) -> None:
         """Select a body, or nothing."""
@@ -268,56 +291,18 @@ class Panel(TabHost):
         alone = len(self.screen.rollouts()) == 1
         in_space = mode == PARTICLES or (mode == PICTURE and alone)
         self.drawing.particles(step, mode == PARTICLES, size, self.screen.compares)
+        self.drawing.paths(step if in_space and self.view_tab.paths_shown.value else None)
+        self.drawing.velocities(step if in_space and self.view_tab.arrows_shown.value else None, size)
         self.drawing.cameras(in_space and self.view_tab.cameras_shown.value, self.screen.view)
         self.drawing.measured(step if in_space and self.view_tab.truth_shown.value else None, size)
         self.edit_tab.show_handles(in_space and step == 0)
-        self.said.content = self._sentence()
+        self.said.content = sentence(self.screen)
         self.ask_picture()
         self._show_figures(step)
 
-    def _sentence(self) -> str:
-        if self.screen.mode == PARTICLES:
-            return "The particles that the model moves. Drag to look around."
-        if len(self.screen.rollouts()) > 1:
-            first, second = (self.session.label(rollout) for rollout in self.screen.rollouts())
-            return f"The same throw twice, as the model predicts it: **{first}**, and **{second}**."
-        if self.screen.mode == PICTURE:
-            return "What the model predicts, from any side. Drag to look around."
-        return (
-            "The model saw **two frames** and predicts the rest. Bright in the error is wrong. "
-            "Click a body, or take it away."
-        )
-
     def _show_figures(self, step: int) -> None:
-        session = self.session
-        now = session.now
-        lines = [f"step **{min(step, now.num_steps)}** of {now.num_steps}"]
-        if now.is_edited:
-            lines.append("edited: no truth to compare with")
-        elif step > self.opened.num_true_steps:
-            lines.append("the recording has ended: no truth to compare with")
-        elif (found := self._measured(step)) is not None:
-            seen, near = metric(PSNR), metric(CHAMFER)
-            lines.append(
-                f"{seen.title} **{seen.shown(found[PSNR])} {seen.printed_unit}** in camera {self.screen.view}, "
-                f"**{near.shown(found[CHAMFER])} {near.printed_unit}** to what was measured"
-            )
-        self.figures.content = "  \n".join(lines)
-
-    def _measured(self, step: int) -> dict[str, float] | None:
-        """Return the figures of a step, None while the picture of the film is not drawn."""
-        session, view = self.session, self.screen.view
-        if step > session.now.num_steps:
-            return None
-        known = session.now.figures
-        if (step, view) not in known:
-            picture = self.screen.film_picture(step)
-            if picture is None and self.screen.mode != FILM and not self._playing.is_set():
-                picture = session.render(step, self.opened.cameras[view : view + 1])[0]
-            if picture is None:
-                return None
-            known[step, view] = session.measure(step, view, self.screen.as_recorded(picture))
-        return known[step, view]
+        may_render = self.screen.mode != FILM and not self._playing.is_set()
+        self.figures.content = figures(self.screen, step, may_render)
 
     def request(self, step: int) -> Request | None:
         """Return what to draw of a step; None where no picture is shown."""

@@ -26,6 +26,8 @@ class Rollout:
         self.colors: dict[int, UInt8[NDArray, "particle 3"]] = {}
         self.figures: dict[tuple[int, int], dict[str, float]] = {}  # by step and recorded camera
         self.number = next(_numbers)
+        # What the generator's own simulation shows after the same edits: pictures of the recorded cameras.
+        self.true_pictures: UInt8[NDArray, "step view height width 3"] | None = None
         self._last: SimulatedRollout | None = None
         self._lock = threading.Lock()
 

@@ -8,6 +8,8 @@ import viser
 from vpd_lightning.viewer.panes import SELECTED
 from vpd_lightning.viewer.session import Session
 
+_MOST_LINES = 400
+_ARROW_STEPS = 3
 _BESIDE = 1.15  # a kept scene stands so many widths of the workspace to the side
 
 
@@ -79,6 +81,37 @@ class SceneDrawing:
             return
         points, colors = self.session.opened.seen_points(step)
         self._cloud("measured", points, colors, 0.6 * size, True, np.zeros(3))
+
+    def paths(self, step: int | None) -> None:
+        """Draw the ways that moving particles took until a step; None draws nothing."""
+        found = self.session.motion(step, _MOST_LINES) if step else None
+        if found is None or not len(found[0]):
+            self.remove("paths")
+            return
+        ways, colors = found  # (step, particle, 3), (particle, 3)
+        segments = np.stack([ways[:-1], ways[1:]], axis=2).reshape(-1, 2, 3)
+        shades = np.tile(colors[None, :, None], (len(ways) - 1, 1, 2, 1)).reshape(-1, 2, 3)
+        self._handles["paths"] = self.client.scene.add_line_segments(
+            "/paths", segments.astype(np.float32), shades, thickness=2.0, thickness_units="screen"
+        )
+
+    def velocities(self, step: int | None, size: float) -> None:
+        """Draw where moving particles will be in a few steps at the velocity of a step; None draws nothing."""
+        found = None if step is None else self.session.motion(max(step, 1), _MOST_LINES // 2)
+        if found is None or not len(found[0]):
+            self.remove("velocities")
+            return
+        ways, colors = found
+        begin = ways[-1] if step else ways[-2]
+        arrows = np.stack([begin, begin + _ARROW_STEPS * (ways[-1] - ways[-2])], axis=1)
+        self._handles["velocities"] = self.client.scene.add_arrows(
+            "/velocities",
+            arrows.astype(np.float32),
+            np.repeat(colors[:, None], 2, axis=1),
+            shaft_radius=0.1 * size,
+            head_radius=0.3 * size,
+            head_length=0.6 * size,
+        )
 
     def remove(self, name: str) -> None:
         """Take something out of the scene."""

@@ -35,12 +35,13 @@ class Screen:
     """Draws one session into one browser's canvas.
 
     ``mode`` is one of ``MODES``; ``view`` the recorded camera of the film, ``rows`` the rows of a free picture, and
-    ``compares`` whether an edited scene stands beside what it is compared with.
+    ``compares`` whether an edited scene stands beside what it is compared with, and ``shows_true`` whether beside what
+    the generator's own simulation makes of the edit, where that is known.
     """
 
     def __init__(self, client: viser.ClientHandle, session: Session):
         self.client, self.session = client, session
-        self.mode, self.compares = FILM, True
+        self.mode, self.compares, self.shows_true = FILM, True, True
         self.view, self.rows = session.opened.input_views[0], 256
         self.last_shown: UInt8[NDArray, "_ _ 3"] | None = None
 
@@ -118,7 +119,16 @@ class Screen:
             labels = ["predicted"]
             truth, error = self._truth(request.panes[0].step, pictures[0])
             images, labels = [truth, images[0], error], ["recorded", *labels, "error"]
+        elif (true_picture := self.true_picture(request.panes[-1].step)) is not None:
+            images, labels = [*images, true_picture], [*labels, f"MuJoCo: {labels[-1]}"]
         return compose(self._layout(len(images), cameras.width / cameras.height), images, labels)
+
+    def true_picture(self, step: int) -> UInt8[NDArray, "height width 3"] | None:
+        """Return what the generator's own simulation shows of an edited scene; None where that is not known."""
+        pictures = self.session.now.true_pictures
+        if self.mode != FILM or not self.shows_true or pictures is None or step >= len(pictures):
+            return None
+        return pictures[step, self.view]
 
     def _truth(self, step: int, picture: UInt8[NDArray, "_ _ 3"]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         opened = self.session.opened
@@ -159,13 +169,15 @@ class Screen:
         rollouts, now = self.rollouts(), self.session.now
         viewpoint = self.viewpoint()
         count = len(rollouts) if len(rollouts) > 1 else (3 if self.mode == FILM and not now.is_edited else 1)
+        if self.mode == FILM and now.is_edited and self.true_picture(min(step, now.num_steps)) is not None:
+            count += 1
         if self.mode == FILM or len(rollouts) > 1:
             cameras = viewpoint.cameras(self.film_rows[-1])
             found = self._layout(count, cameras.width / cameras.height).find(x, y)
             if found is None:
                 return None
             pane, x, y = found
-            rollout = now if len(rollouts) == 1 else rollouts[pane]
+            rollout = now if len(rollouts) == 1 else rollouts[min(pane, len(rollouts) - 1)]  # MuJoCo's is the last
         else:
             cameras, rollout = viewpoint.cameras(self.film_rows[-1]), now
         if rollout is not now:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -22,6 +22,7 @@ from vpd_lightning.viewer.opened_scene import OpenedScene
 from vpd_lightning.viewer.rollout import Rollout
 
 COMBINATIONS = ("replace", "add", "subtract", "intersect")
+_MOVES = 0.002  # metres a step
 
 
 class Session:
@@ -225,6 +226,26 @@ class Session:
             rollout.colors[step] = colors
         return state, colors
 
+    def motion(
+        self, step: int, most: int
+    ) -> tuple[Float[NDArray, "step particle 3"], UInt8[NDArray, "particle 3"]] | None:
+        """Return where moving particles (``most`` of them at most) were from step 0 to a step, and their colours.
+
+        None where nothing moves, or the step is not simulated.
+        """
+        with self.lock:
+            rollout = self.now
+        if not 1 <= step <= rollout.num_steps:
+            return None
+        positions = torch.stack([state.positions[0] for state in rollout.states[: step + 1]]).float().cpu().numpy()
+        there = rollout.states[step].mask[0].cpu().numpy()
+        moved = np.linalg.norm(np.diff(positions, axis=0), axis=-1).max(axis=0, initial=0.0)
+        chosen = np.flatnonzero(there & (moved > _MOVES))
+        chosen = chosen[:: max(1, -(-len(chosen) // most))]
+        if not len(chosen):
+            return None
+        return positions[:, chosen], self.shown(0)[1][chosen]
+
     def _at(self, step: int, of_kept: bool) -> tuple[Rollout, int]:
         rollout = self.kept if of_kept and self.kept is not None else self.now
         return rollout, min(max(step, 0), rollout.num_steps)
@@ -250,11 +271,7 @@ class Session:
         figures = {"particles": float(state.mask.sum())}
         if not self.has_truth(step):
             return figures
-        pair = (
-            torch.from_numpy(np.array(part)).float() / 255  # a copy: pictures that are kept cannot be written
-            for part in (image, self.opened.truth[step, view])
-        )
-        figures[PSNR] = float(psnr(*pair))
+        figures[PSNR] = picture_psnr(image, self.opened.truth[step, view])
         points, _ = self.opened.seen_points(step)
         figures[CHAMFER] = chamfer(state.positions[0][state.mask[0]], torch.from_numpy(points)).mean
         return figures
@@ -263,6 +280,12 @@ class Session:
         """Return the edits made so far."""
         with self.lock:
             return self.now.editor.operations
+
+
+def picture_psnr(image: UInt8[NDArray, "height width 3"], truth: UInt8[NDArray, "height width 3"]) -> float:
+    """Return the PSNR (dB) of a picture."""
+    pair = (torch.from_numpy(np.array(part)).float() / 255 for part in (image, truth))  # copies: some are read-only
+    return float(psnr(*pair))
 
 
 def to_uint8(image: Tensor) -> NDArray[np.uint8]:

@@ -55,6 +55,10 @@ class TabHost(ABC):
         """Simulate in the background, unless that goes on already."""
 
     @abstractmethod
+    def simulate_truth_again(self) -> None:
+        """Have the generator's own simulation make the same edits, in the background, where it can."""
+
+    @abstractmethod
     def look_through(self, view: int) -> None:
         """Put the browser's camera where a recorded one is, and show its film."""
 
