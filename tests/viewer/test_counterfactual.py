@@ -69,4 +69,8 @@ def test_the_thrown_block_is_seen_beside_mujocos_own_and_compared(opened: Opened
     near, far = picture_psnr(predicted, pictures[2, 0]), picture_psnr(predicted, opened.truth[2, 0])
     assert near > far + 3  # the edit, and not the recording, is what it is like
     assert f"MuJoCo's own simulation: PSNR **{near:.2f} dB**" in figures(screen, 2, False)
+    # On a telephone the panes stand above the panel.
+    narrow = Screen(SimpleNamespace(camera=SimpleNamespace(image_height=840, image_width=390)), session)
+    layout = narrow._layout(3, 1.0)
+    assert layout.height > 2 * (max(top for top, _ in layout.corners) + layout.pane_height)
     assert np.array_equal(screen.true_picture(2), pictures[2, screen.view]) and screen.true_picture(9) is None

@@ -67,7 +67,8 @@ def _show(viewer: Any, config: Mapping[str, Any]) -> None:
     from vpd_lightning.runs.threads import set_threads
     from vpd_lightning.viewer.opened_scene import open_scene
 
-    set_threads(config["num_threads"])
+    # The browser draws on this machine, too. Where PyTorch's threads wait for a core that it holds, all of them wait.
+    set_threads(config["num_threads"], num_free=1)
     model = load_particle_simulator(config)
     split, number = config["split"], config["trajectory"]
     viewer.say("Looking for the recording; where its data are missing, it is made ...")

@@ -21,7 +21,10 @@ _GAP, _LABEL = 6, 26  # pixels
 
 @dataclass(frozen=True)
 class Layout:
-    """Where panes of one size stand in a canvas of ``height`` x ``width`` pixels; a label is above each."""
+    """Where panes of one size stand in a canvas of ``height`` x ``width`` pixels; a label is above each.
+
+    They may leave the lower part of the canvas free.
+    """
 
     height: int
     width: int

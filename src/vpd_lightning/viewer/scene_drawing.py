@@ -107,7 +107,7 @@ class SceneDrawing:
         self._handles["velocities"] = self.client.scene.add_arrows(
             "/velocities",
             arrows.astype(np.float32),
-            np.repeat(colors[:, None], 2, axis=1),
+            colors,
             shaft_radius=0.1 * size,
             head_radius=0.3 * size,
             head_length=0.6 * size,

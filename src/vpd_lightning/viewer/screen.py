@@ -1,6 +1,7 @@
 """What stands in a browser's canvas: the film of a recorded camera, or the picture of the browser's own."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -28,6 +29,9 @@ FILM_ROWS = 128
 """Smaller images are rendered at twice their size or more, up to so many rows."""
 
 _MAX_ROWS = 720  # of what is sent to the browser
+_NARROW, _FREE_OF_PANEL = 576, 0.4
+"""A canvas of so few columns (CSS pixels) is a telephone's: the panel lies over all but this share at its top."""
+
 _UNKNOWN_SIZE = (720, 960)  # of a browser that did not say how large it is
 
 
@@ -194,7 +198,9 @@ class Screen:
     def _layout(self, count: int, pane_aspect: float) -> Layout:
         height, width = self._canvas()
         scale = min(1.0, _MAX_ROWS / height)
-        return lay_out(count, pane_aspect, max(round(scale * height), 64), max(round(scale * width), 64))
+        high, wide = max(round(scale * height), 64), max(round(scale * width), 64)
+        free = round(_FREE_OF_PANEL * high) if width < _NARROW else high
+        return replace(lay_out(count, pane_aspect, free, wide), height=high)
 
 
 def _panes(rollouts: Sequence[Rollout], step: int) -> list[Pane]:
