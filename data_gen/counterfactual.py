@@ -88,7 +88,7 @@ def run_counterfactual(
 
     if family_of(manifest) is None:
         raise DataError(f"{manifest.name} cannot be simulated anew: {', '.join(FAMILIES)} can.")
-    backend = manifest.settings.get("renderer") or "egl"
+    backend = _backend(manifest)
     with tempfile.TemporaryDirectory() as folder:
         request, out = Path(folder) / "request.json", Path(folder) / "pictures.npz"
         words = {
@@ -108,6 +108,11 @@ def run_counterfactual(
     return pictures
 
 
+def _backend(manifest: Manifest) -> str:
+    """Return what drew the recordings: ``raycast``, ``egl``, ``osmesa``, ``blender``; settings may say ``auto``."""
+    return manifest.generator.rpartition(" ")[2]
+
+
 def simulate(
     manifest: Manifest, path: Path, frame: int, changes: Mapping[int, Change], num_steps: int
 ) -> NDArray[np.uint8]:
@@ -119,7 +124,7 @@ def simulate(
     assert family is not None
     package, (_, base) = import_module(f"data_gen.{family}"), load_preset(manifest.scene, manifest.preset)
     known = {key: value for key, value in manifest.settings.items() if key != "scene_version"}
-    settings = checked_settings(package.Settings, base, known, f"{manifest.folder}")
+    settings = checked_settings(package.Settings, base, known | {"renderer": _backend(manifest)}, f"{manifest.folder}")
     with h5py.File(path) as file:
         attributes = dict(file.attrs)
     begin = import_module(f"data_gen.{family}.counterfactual").begin

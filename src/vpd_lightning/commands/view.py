@@ -76,7 +76,7 @@ def _show(viewer: Any, config: Mapping[str, Any]) -> None:
     path = choose_trajectory(manifest, split, number)
     start_frame = config["start_frame"]
     viewer.say("Looking at two frames of the recording ...")
-    title = f"{manifest.scene.replace('_', ' ')}, {split} recording {number}".capitalize()
+    title = f"{manifest.scene.replace('_', ' ')}, {split} recording {number}".capitalize().replace("Mujoco", "MuJoCo")
     opened = open_scene(model.simulator, path, start_frame, model.input_views, title, manifest.scene, manifest)
     viewer.show(opened, beside_checkpoint(model.path, "view"), config["num_steps"])
     print(f"{model.name}, {manifest.relative(path)}, frame {start_frame}", flush=True)

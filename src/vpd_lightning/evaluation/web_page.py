@@ -8,7 +8,7 @@ from typing import Any
 from vpd_lightning.evaluation.report import step_table
 from vpd_lightning.evaluation.summary import gain, horizons, motion_rows, seen_lines, summary_lines
 from vpd_lightning.files import AtomicPath
-from vpd_lightning.media.html import film, folded, html_page, paragraph, picture, table
+from vpd_lightning.media.html import films, folded, html_page, paragraph, picture, table
 from vpd_lightning.metrics.registry import REFERENCES, blocks, image_metrics, motion_metrics
 
 _CAPTIONS = {
@@ -24,8 +24,8 @@ def write_web_page(folder: Path, metrics: Mapping[str, Any]) -> Path:
     Pictures and films are shown by their relative names, so the folder can be moved or sent as it is.
     """
     protocol = metrics["protocol"]
-    films = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.webm"))
-    pictures = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.png"))
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.webm"))
+    pictures = sorted((path.relative_to(folder).as_posix() for path in folder.rglob("*.png")), key=_curves_first)
     parts = [
         paragraph(
             f"{protocol['num_steps']} steps predicted from two frames, of {protocol['num_clips']} clips of "
@@ -36,9 +36,9 @@ def write_web_page(folder: Path, metrics: Mapping[str, Any]) -> Path:
     parts += [paragraph(line, is_warning=True) for line in seen_lines(metrics)]
     if not metrics["finite"]:
         parts.append(paragraph("NOT FINITE: some predictions are NaN or infinite.", is_warning=True))
-    if films:
-        parts.append("<h2>Films</h2>")
-        parts += [film(name, f"{_film_title(name)}: truth, prediction, error; slowed.") for name in films]
+    if names:
+        captions = {name: f"{_film_title(name)}: truth, prediction, error; slowed." for name in names}
+        parts += ["<h2>Films</h2>", films(captions)]
     parts += ["<h2>Figures</h2>", *_image_table(metrics), *_motion_table(metrics)]
     parts += [f"<p>{escape(line)}</p>" for line in _particle_lines(metrics)]
     if pictures:
@@ -55,6 +55,10 @@ def write_web_page(folder: Path, metrics: Mapping[str, Any]) -> Path:
         title = f"{metrics.get('model', 'model')}, {protocol['split']}"
         partial.write_text(html_page(title, parts), encoding="utf-8")
     return path
+
+
+def _curves_first(name: str) -> tuple[bool, str]:
+    return Path(name).stem != "curves", name
 
 
 def _film_title(name: str) -> str:

@@ -1,6 +1,6 @@
 """Web pages that open from disk, without a server and without a network: films first, then figures."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 
 _STYLE = """
@@ -14,6 +14,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 td, th { padding: .25rem .8rem; text-align: right; border-bottom: 1px solid var(--line); font-weight: normal; }
 thead th, th[scope=col] { color: #999; } th:first-child, td:first-child { text-align: left; }
 td.model { color: #fff; font-weight: 600; }
+.films { display: grid; grid-template-columns: repeat(auto-fit, minmax(30rem, 1fr)); gap: 1rem; }
 figure { margin: 0 0 1.5rem; } figcaption { color: #999; font-size: 13px; }
 img, video { max-width: 100%; border-radius: 4px; } video { width: 100%; image-rendering: pixelated; }
 .warning { border-left: 4px solid #e8590c; padding: .3rem 1rem; background: #ffffff0d; }
@@ -36,8 +37,12 @@ def paragraph(text: str, is_warning: bool = False) -> str:
     return f"<p{marked}>{escape(text)}</p>"
 
 
-def film(name: str, caption: str) -> str:
-    """Return a film that plays by itself, round and round; ``name`` is relative to the page."""
+def films(captions: Mapping[str, str]) -> str:
+    """Return films that play by themselves, round and round: captions by names that are relative to the page."""
+    return "\n".join(['<div class="films">', *(_film(name, caption) for name, caption in captions.items()), "</div>"])
+
+
+def _film(name: str, caption: str) -> str:
     return (
         f'<figure><video src="{escape(name)}" autoplay loop muted playsinline controls></video>'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
