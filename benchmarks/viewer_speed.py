@@ -81,7 +81,8 @@ class Visit:
 
     def blue(self, page: Any, from_x: float = 0.0) -> Any:
         """Return where the screen, left of the panel, has the blue of the block's faces; panes right of ``from_x``."""
-        picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR).astype(int)
+        shown = page.screenshot(clip={"x": 0, "y": 0, "width": 950, "height": 800})
+        picture = cv2.imdecode(np.frombuffer(shown, np.uint8), cv2.IMREAD_COLOR).astype(int)
         shade, green, red = (picture[:, int(from_x * 950) : 950, channel] for channel in range(3))
         return (shade - red > 60) & (shade - green > 40)
 

@@ -251,7 +251,7 @@ def test_the_block_is_dragged_and_both_panes_show_it_where_it_is(page: Page, pan
     wait_until(page, lambda: int(panel.session.selected.sum()) > 100)
     tab(page, "Edit")
     press(page, "Move by hand")
-    wait_until(page, lambda: panel.edit_tab.handles._hulls[0].visible)
+    wait_until(page, lambda: panel.edit_tab.handles._hulls and panel.edit_tab.handles._hulls[0].visible)
     page.wait_for_timeout(1000)  # the browser draws the hull, which nothing reports
     camera = panel.screen.free_viewpoint().cameras(int(panel.client.camera.image_height))
     state, chosen = panel.session.now.states[0], panel.session.selected

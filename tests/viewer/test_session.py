@@ -250,6 +250,23 @@ def test_a_film_is_drawn_ahead_and_loops_without_being_drawn_again(opened: Opene
         shown.pictures[-1][0][0][:] = 0
 
 
+def test_what_was_drawn_for_an_older_request_is_shown_for_the_one_that_is_the_same(opened: OpenedScene) -> None:
+    shown, camera = Shown(), RecordedViewpoint(opened.cameras[:1], 0)
+    held = HeldRenderer(opened.simulator.renderer)
+    view = ProgressiveView(held, shown)
+    first, again = (Request([Pane(3, 0, opened.scene.current)], camera, 24) for _ in range(2))
+    try:
+        view.ask(first)
+        held.wait()
+        view.ask(again)  # while the first is drawn: the browser's camera said where it is
+        held.draw()
+        assert shown.event.wait(HANG)
+        assert len(shown.pictures) == 1 and not held.begun.acquire(blocking=False)  # drawn once
+    finally:
+        held.let.release(100)
+        view.stop()
+
+
 class CountingRenderer:
     """A renderer that counts its drawings."""
 

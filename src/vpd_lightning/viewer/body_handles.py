@@ -28,21 +28,23 @@ class BodyHandles:
 
     def __init__(self, panel: TabHost, select: Select, move: Move):
         self.panel, self.session, self._select, self._move = panel, panel.session, select, move
-        self._hulls: list[Any] = []
+        self._hulls: list[Any] | None = None  # made where they are shown for the first time
         self._gizmo: Any = None
         self._visible = False
 
-    def make(self) -> None:
-        """Make the hulls of the bodies of the edited scene."""
-        for handle in self._hulls:
+    def renew(self) -> None:
+        """Forget the hulls: the scene was edited."""
+        for handle in self._hulls or ():
             if handle is not None:
                 handle.remove()
-        self._hulls = [self._hull(number) for number in range(len(self.session.cluster_sizes()))]
+        self._hulls = None
 
     def show(self, visible: bool) -> None:
-        """Show the handles, or hide them."""
+        """Show the handles of the edited scene's bodies, or hide them."""
         self._visible = visible
-        for handle in (*self._hulls, self._gizmo):
+        if visible and self._hulls is None:
+            self._hulls = [self._hull(number) for number in range(len(self.session.cluster_sizes()))]
+        for handle in (*(self._hulls or ()), self._gizmo):
             if handle is not None and handle.visible != visible:
                 handle.visible = visible
 
@@ -60,7 +62,7 @@ class BodyHandles:
         self._gizmo = self.panel.client.scene.add_transform_controls(
             "/gizmo", scale=0.7 * size, depth_test=False, position=center, visible=self._visible
         )
-        hull = self._hulls[body] if body is not None and body < len(self._hulls) else None
+        hull = self._hulls[body] if self._hulls and body is not None and body < len(self._hulls) else None
 
         async def turned(event: Any) -> None:
             gizmo = event.target

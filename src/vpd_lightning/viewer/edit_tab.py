@@ -61,7 +61,7 @@ class EditTab:
         if self.clusters.options != options:
             self.clusters.options = options
         self._show_selection()
-        self.handles.make()
+        self.handles.renew()
 
     def _show_selection(self) -> None:
         body, count = self.session.selected_body, int(self.session.selected.sum())

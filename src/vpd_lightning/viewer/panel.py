@@ -25,6 +25,7 @@ from vpd_lightning.viewer.view_tab import ViewTab
 _MOVED = 0.001
 """A camera that moved by this share of its distance to what it looks at was moved by hand."""
 
+_FIRST_SECONDS = 5.0
 _POLL_SECONDS = 0.02
 
 
@@ -52,6 +53,7 @@ class Panel(TabHost):
         self.touched_at = time.monotonic()
         self._playing, self._closed = threading.Event(), threading.Event()
         self._busy, self._truth_busy, self._stepping = threading.Lock(), threading.Lock(), threading.RLock()
+        self._first_shown = threading.Event()
         self._told, self._arrived = np.zeros(3), False  # where the browser's camera was put, and whether it went there
         gui: Any = client.gui
         self.look_through(self.screen.view)
@@ -75,12 +77,18 @@ class Panel(TabHost):
         client.scene.on_click()(lambda event: self.act(lambda: self._clicked(event)))
         client.camera.on_update(lambda _: self.act(self._camera_moved))
         self._add_keys()
-        self.edit_tab.refresh()
-        self.presets.refresh()
         self.set_playing(True)
         self.redraw()
-        for work in (self._play, self.run_simulation):
+        for work in (self._play, self._begin):
             threading.Thread(target=work, daemon=True, name="vpd-view film").start()
+
+    def _begin(self) -> None:
+        """Do all that can wait for the first picture."""
+        if self.screen.mode != PARTICLES:
+            self._first_shown.wait(_FIRST_SECONDS)
+        self._attempt(self.edit_tab.refresh)
+        self._attempt(self.presets.refresh)
+        self.run_simulation()
 
     def _add_keys(self) -> None:
         def step(by: int) -> None:
@@ -319,6 +327,7 @@ class Panel(TabHost):
         if self._closed.is_set():
             return
         self.screen.show(request, pictures, is_full)
+        self._first_shown.set()
         if is_full and self.screen.mode == FILM and not self.session.now.is_edited:
             self._attempt(lambda: self._show_figures(int(self.step.value)))
 

@@ -88,6 +88,7 @@ class ProgressiveView:
         self._frames = FrameCache() if frames is None else frames
         self._condition, self._showing = threading.Condition(), threading.Lock()
         self._request: Request | None = None
+        self._finished: Request | None = None  # of which the full pictures were shown last
         self._number, self._asked_at, self._stopped, self._film_grew = 0, 0.0, False, False
         self._pixels_per_second = 50_000.0
         self.coarse_seconds: list[float] = []  # from asking to showing, for benchmarks
@@ -145,6 +146,7 @@ class ProgressiveView:
             serves = not is_full and latest is not None and self._kept(latest) is None
             if request is latest or (serves and request.shows_same_scenes(latest)):
                 self._show(request, pictures, is_full)
+                self._finished = request if is_full else None
 
     def _work(self) -> None:
         done = 0
@@ -161,7 +163,10 @@ class ProgressiveView:
 
     def _draw_asked(self, request: Request, number: int, asked: float) -> bool:
         """Show what was asked for, coarse and then full; False where something newer was asked for in between."""
-        if self._kept(request) is not None:
+        kept = self._kept(request)
+        if kept is not None:
+            if self._finished is not request:  # drawn after it was asked for, for an older request
+                self._show_if_current(request, kept, True)
             return self._is_still(number)
         rows = self._coarse_rows(request)
         coarse = self._draw(request, rows, number, in_bands=False)
