@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from vpd_lightning.viewer.body_names import body_names, color_name
 from vpd_lightning.viewer.frame_cache import FrameCache
 from vpd_lightning.viewer.interpolation import between
+from vpd_lightning.viewer.preset_buttons import readable
 
 
 @pytest.mark.parametrize(
@@ -74,3 +75,9 @@ def test_pictures_that_were_not_asked_for_the_longest_go_first() -> None:
     assert frames.get(2) is not None and frames.get(3)[0, 0, 0] == 4  # type: ignore[index]
     frames.put("large", np.zeros((100, 100, 3), np.uint8))
     assert frames.get("large") is not None and frames.get(0) is None
+
+
+def test_buttons_have_the_bodies_colours_and_can_be_read() -> None:
+    assert readable((200, 30, 20)) == (200, 30, 20)
+    red, green, blue = readable((250, 230, 20))
+    assert red == pytest.approx(green * 250 / 230, abs=1) and 0.299 * red + 0.587 * green + 0.114 * blue < 0.43 * 255

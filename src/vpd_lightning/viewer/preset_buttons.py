@@ -1,5 +1,6 @@
 """Buttons that do one thing at a click, named from what is there: take the ball away, throw it harder."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,15 @@ from vpd_lightning.viewer.tab_host import TabHost
 
 _MOST_BODIES = 3
 _HARDER = 1.5
+_DARK = 0.42  # luminance
 _MOVES = 0.001  # metres a step
+
+
+def readable(color: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Return a body's colour, as dark as white letters need."""
+    luminance = (0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]) / 255
+    red, green, blue = (round(channel * min(1.0, _DARK / max(luminance, 1e-6))) for channel in color)
+    return red, green, blue
 
 
 class PresetButtons:
@@ -26,18 +35,18 @@ class PresetButtons:
         for button in self._buttons:
             button.remove()
         self._buttons = []
-        names = self.session.body_names()
+        names, colors = self.session.body_names(), self.session.body_colors()
         with self._folder:
             for number, name in enumerate(names[:_MOST_BODIES]):
-                self._add(f"Take the {name} away", lambda n=number, w=name: self._take(n, w))
+                self._add(f"Take the {name} away", partial(self._take, number, name), readable(colors[number]))
             if names:
                 self._add("Take the floor away", self._take_floor)
             fastest = self._fastest(len(names))
             if fastest is not None:
                 self._add(f"Throw the {names[fastest]} harder", lambda: self._throw(fastest, names[fastest]))
 
-    def _add(self, label: str, action: Any) -> None:
-        button = self.panel.client.gui.add_button(label, color="blue")
+    def _add(self, label: str, action: Any, color: Any = "blue") -> None:
+        button = self.panel.client.gui.add_button(label, color=color)
         button.on_click(lambda _: self.panel.act(action))
         self._buttons.append(button)
 

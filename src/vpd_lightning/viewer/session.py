@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -87,11 +87,23 @@ class Session:
 
     def body_names(self) -> list[str]:
         """Return what a person calls each object-like cluster, in the order of their numbers."""
+        return body_names(self.opened.kind, *self._clusters_and_colors())
+
+    def body_colors(self) -> list[tuple[int, int, int]]:
+        """Return the colour of each object-like cluster, in the order of their numbers."""
+        clusters, colors = self._clusters_and_colors()
+        found = []
+        for number in range(len(self.cluster_sizes())):
+            red, green, blue = (255 * np.median(colors[clusters == number], axis=0)).round().astype(int).tolist()
+            found.append((red, green, blue))
+        return found
+
+    def _clusters_and_colors(self) -> tuple[Int64[NDArray, " particle"], Float[NDArray, "particle 3"]]:
         with self.lock:
             state = self.now.editor.state
         clusters = torch.where(state.mask, state.clusters, -1).cpu().numpy()
         colors = np.full((len(clusters), 3), 0.5) if state.colors is None else state.colors.float().cpu().numpy()
-        return body_names(self.opened.kind, clusters, colors)
+        return clusters, colors
 
     @property
     def selected_body(self) -> int | None:
