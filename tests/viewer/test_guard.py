@@ -3,7 +3,6 @@
 import gzip
 import http.client
 import socket
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,11 @@ import pytest
 pytest.importorskip("viser")
 
 import msgspec
-import viser
 from viser import _messages
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
 
+from tests.viewer import clients
+from tests.viewer.clients import camera_message, drain, serialized, settled_panel
 from tests.viewer.opened import open_tossed_box
 from tests.waiting import HANG, wait_until
 from vpd_lightning.errors import ConfigError
@@ -24,7 +23,6 @@ from vpd_lightning.viewer.guard import MAX_UPLOAD_BYTES, new_token, require_free
 from vpd_lightning.viewer.server import Viewer
 
 TOKEN = "a-token-for-tests"
-PROTOCOL = f"viser-v{viser.__version__}"
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +45,7 @@ def ask(viewer: Viewer, path: str, **headers: str) -> http.client.HTTPResponse:
 
 
 def socket_of(viewer: Viewer, query: str = f"?token={TOKEN}", **options):
-    return connect(f"ws://127.0.0.1:{viewer.port}/{query}", subprotocols=[PROTOCOL], open_timeout=HANG, **options)
+    return clients.socket_of(viewer, query, **options)
 
 
 def test_it_listens_on_the_loopback_interface_alone(viewer: Viewer) -> None:
@@ -132,25 +130,6 @@ def test_tokens_differ_and_no_share_link_is_made(viewer: Viewer) -> None:
     assert viewer.server.request_share_url() is None
 
 
-def settled_panel(viewer: Viewer, before: set[int]):
-    """The panel of the client that just came."""
-    wait_until(lambda: set(viewer.panels) - before)
-    return viewer.panels[(set(viewer.panels) - before).pop()]
-
-
-def drain(connection) -> None:
-    """Read what the server sends, so that its buffers do not fill."""
-
-    def read() -> None:
-        try:
-            while True:
-                connection.recv()
-        except ConnectionClosed:
-            pass
-
-    threading.Thread(target=read, daemon=True).start()
-
-
 def test_uploads_beyond_the_cap_and_beyond_what_was_announced_are_dropped(viewer: Viewer) -> None:
     before = set(viewer.panels)
     with socket_of(viewer) as connection:
@@ -174,19 +153,6 @@ def test_uploads_beyond_the_cap_and_beyond_what_was_announced_are_dropped(viewer
         for part in (0, 1):
             connection.send(serialized(_messages.FileTransferPart(target, "a", part, b"12345")))
         wait_until(lambda: set(pending) == {"b"})
-
-
-def camera_message() -> bytes:
-    """A browser reports its camera first; until then viser announces no client."""
-    return serialized(
-        _messages.ViewerCameraMessage(
-            (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 3.0), 0.9, 0.01, 100.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-        )
-    )
-
-
-def serialized(message) -> bytes:
-    return msgspec.msgpack.encode(message.as_serializable_dict())
 
 
 JUNK = (None, True, -1, 3.5, float("nan"), 1e308, "", "x" * 500, b"\0\xff", [], [1, "a"], {}, {"value": 1}, [0.0] * 4)

@@ -1,0 +1,41 @@
+"""A page that nobody touches begins again."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("viser")
+
+from tests.viewer.clients import camera_message, drain, settled_panel, socket_of
+from tests.viewer.opened import open_tossed_box
+from tests.waiting import wait_until
+from vpd_lightning.editing.operations import Delete
+from vpd_lightning.editing.selectors import Box
+from vpd_lightning.viewer.screen import FILM, PARTICLES
+from vpd_lightning.viewer.server import Viewer
+
+TOKEN = "a-token-for-tests"
+
+
+def test_an_exhibition_begins_again_where_nobody_touches_it(tmp_path: Path) -> None:
+    viewer = Viewer(0, TOKEN, kiosk=0.2)
+    try:
+        viewer.show(open_tossed_box(tmp_path), tmp_path / "view", 3)
+        with socket_of(viewer, f"?token={TOKEN}") as connection:
+            connection.send(camera_message())
+            drain(connection)
+            panel = settled_panel(viewer, set())
+            counts = []
+
+            def edit() -> None:
+                panel.session.apply(Delete(Box([-9, -9, -9], [0, 9, 9])))
+                counts.append(len(panel.session.operations()))
+                panel.set_mode(PARTICLES)
+                panel.set_playing(False)
+
+            panel.act(lambda: panel.edit(edit))
+            wait_until(lambda: panel.is_untouched)
+            assert counts == [1] and panel.session.operations() == []
+            assert panel.screen.mode == FILM and panel.session.now is viewer.opened.rollout
+    finally:
+        viewer.stop()
