@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from data_gen.settings import checked_settings, load_preset
 from vpd_lightning.data.manifest import Manifest, load_manifest
-from vpd_lightning.errors import DataError
+from vpd_lightning.errors import ConfigError, DataError
 
 FAMILIES = ("mujoco_block", "deformable")
 """Packages of ``data_gen`` with a ``counterfactual`` module."""
@@ -65,7 +65,10 @@ def family_of(manifest: Manifest) -> str | None:
     """Return the package that can simulate a data set anew; None where none can."""
     if not manifest.generator.startswith("vpd-data generate") or manifest.settings.get("sensor"):
         return None
-    family, _ = load_preset(manifest.scene, manifest.preset)
+    try:
+        family, _ = load_preset(manifest.scene, manifest.preset)
+    except ConfigError:  # a preset of somebody else's
+        return None
     return family if family in FAMILIES else None
 
 

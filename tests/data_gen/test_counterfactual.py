@@ -87,6 +87,7 @@ def test_a_process_of_its_own_draws_the_same(manifest: Manifest) -> None:
 def test_what_cannot_be_simulated_is_said(manifest: Manifest) -> None:
     imported = Manifest(**{**vars(manifest), "generator": "vpd-data import"})
     assert family_of(manifest) == "mujoco_block" and family_of(imported) is None
+    assert family_of(Manifest(**{**vars(manifest), "preset": "of_somebody_else"})) is None
     with pytest.raises(DataError, match="cannot be simulated anew"):
         run_counterfactual(imported, path_of(manifest), FRAME, {}, 1)
     other = Manifest(**{**vars(manifest), "settings": {**manifest.settings, "timestep": 0.005}})
