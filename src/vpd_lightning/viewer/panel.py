@@ -32,7 +32,7 @@ _POLL_SECONDS = 0.02
 class Panel(TabHost):
     """Connects a browser with a session; every client has its own, so that nothing is shared but the model.
 
-    A ``session`` of a page that was left may be given, with the ``step`` that it showed.
+    A ``session`` of a page that was left may be given, with the ``mode`` (see ``Screen``) that it was in.
     """
 
     def __init__(
