@@ -12,8 +12,9 @@ import torch
 from tests.data.recordings import make_trajectory, write_recordings
 from vpd_lightning.data.background import median_images
 from vpd_lightning.data.collate import ClipSample
-from vpd_lightning.data.dataset import ClipDataset, MovingRays, require_clips, steps_at
+from vpd_lightning.data.dataset import ClipDataset, MovingRays, require_clips
 from vpd_lightning.data.frames import TrajectoryFrames
+from vpd_lightning.data.rollout_lengths import RolloutLengths
 from vpd_lightning.data.schema import write_trajectory
 from vpd_lightning.errors import DataError
 from vpd_lightning.geometry.cameras import project
@@ -188,12 +189,29 @@ def test_the_rollout_length_follows_the_schedule(files: list[Path]) -> None:
     assert lengths == [1] * 10 + [2] * 5 + [4] * 5
 
 
-def test_steps_at_without_a_schedule_is_constant() -> None:
-    assert steps_at(0.9, 6, None) == 6
+def test_where_several_lengths_are_named_every_update_draws_one_for_its_whole_batch(files: list[Path]) -> None:
+    schedule = {0.0: 2, 0.25: [1, 4]}
+    data = dataset(frames(files), num_steps_schedule=schedule, max_steps=80)
+    lengths = [{len(data[step * 4 + sample].rgbs) for sample in range(4)} for step in range(80)]
+    assert lengths[:20] == [{2}] * 20
+    assert set(map(frozenset, lengths[20:])) == {frozenset({1}), frozenset({4})}
+    assert 15 <= lengths[20:].count({4}) <= 45
+    again = dataset(frames(files), num_steps_schedule=schedule, max_steps=80)
+    assert [{len(again[step * 4].rgbs)} for step in range(80)] == lengths
 
 
-@pytest.mark.parametrize("schedule", [{0.5: 2}, {0.0: 0}, {0.0: 2, 1.5: 3}])
-def test_schedules_that_make_no_sense_are_refused(files: list[Path], schedule: dict[float, int]) -> None:
+def test_the_longest_length_that_may_be_drawn_must_fit(files: list[Path]) -> None:
+    with pytest.raises(DataError, match="8 frames, but a clip needs 9"):
+        dataset(frames(files), num_steps=2, num_steps_schedule={0.0: [1, 7]})
+
+
+def test_without_a_schedule_the_length_is_constant() -> None:
+    lengths = RolloutLengths(6, None)
+    assert lengths.longest == lengths.at(0.9, 0, 3) == 6
+
+
+@pytest.mark.parametrize("schedule", [{0.5: 2}, {0.0: 0}, {0.0: 2, 1.5: 3}, {0.0: [1, 0]}, {0.0: []}])
+def test_schedules_that_make_no_sense_are_refused(files: list[Path], schedule: dict[float, Any]) -> None:
     with pytest.raises(ValueError, match="num_steps_schedule"):
         dataset(frames(files), num_steps_schedule=schedule)
 

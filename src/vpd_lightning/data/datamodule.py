@@ -1,6 +1,6 @@
 """The data of one training: clips of the training split, fixed validation clips, the background of fixed cameras."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from vpd_lightning.data.collate import collate_clips
 from vpd_lightning.data.dataset import ClipDataset, MovingRays
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.manifest import load_manifest
+from vpd_lightning.data.rollout_lengths import Schedule
 from vpd_lightning.data.sampler import StepBatchSampler, StepLoader
 from vpd_lightning.data.sensors import load_sensor
 from vpd_lightning.data.sensors.noisy_frames import NoisyFrames
@@ -29,9 +30,9 @@ class VideoDataModule(pl.LightningDataModule):
 
     ``batch_size`` is the global one. ``target_views`` null means all; ``start_frames`` null means every start frame
     that leaves room for the clip; ``num_trajectories`` null means the whole training split. ``num_steps_schedule``
-    maps fractions of the training to rollout lengths and overrides ``num_steps`` in training (null: no schedule);
-    fractions are of ``trainer.max_steps``, or of the time where ``training_progress`` is set
-    (``callbacks.time_budget``). ``moving_ray_fraction`` of the rays goes to pixels that differ from the per-camera
+    maps fractions of the training to rollout lengths, or to lists of which every update draws one, and overrides
+    ``num_steps`` in training (null: no schedule); fractions are of ``trainer.max_steps``, or of the time where
+    ``training_progress`` is set (``callbacks.time_budget``). ``moving_ray_fraction`` of the rays goes to pixels that differ from the per-camera
     training median by more than the thresholds (largest colour channel, in [0, 1]; depth, in metres), or lie within
     ``moving_ray_margin`` pixels of one that does. With ``cache`` decoded frames stay in memory (in each loader worker;
     with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
@@ -49,7 +50,7 @@ class VideoDataModule(pl.LightningDataModule):
         batch_size: int,
         num_workers: int,
         num_steps: int,
-        num_steps_schedule: Mapping[float, int] | None,
+        num_steps_schedule: Schedule | None,
         rays_per_step: int,
         input_views: Sequence[int],
         target_views: Sequence[int] | None,

@@ -1,6 +1,6 @@
 """Training clips: two context frames and rays of the frames after them, drawn from (seed, step, sample index) alone."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch.utils.data import Dataset
 
 from vpd_lightning.data.collate import ClipSample
 from vpd_lightning.data.frame_source import FrameSource
+from vpd_lightning.data.rollout_lengths import RolloutLengths, Schedule
 from vpd_lightning.errors import DataError
 from vpd_lightning.geometry.cameras import rays_through
 from vpd_lightning.randomness import numpy_generator
@@ -57,16 +58,6 @@ class MovingRays:
         return np.flatnonzero(moved).astype(np.int32)
 
 
-def steps_at(fraction: float, num_steps: int, schedule: Mapping[float, int] | None) -> int:
-    """Return the rollout length T after the given fraction of the training.
-
-    ``schedule`` maps fractions of the training to T, each valid from its fraction on; null means ``num_steps`` always.
-    """
-    if not schedule:
-        return num_steps
-    return max((float(start), int(steps)) for start, steps in schedule.items() if float(start) <= fraction)[1]
-
-
 class ClipDataset(Dataset[ClipSample]):
     """Item ``i`` is sample ``i % batch_size`` of the global batch of training step ``i // batch_size``.
 
@@ -86,7 +77,7 @@ class ClipDataset(Dataset[ClipSample]):
         batch_size: int,
         max_steps: int,
         num_steps: int,
-        num_steps_schedule: Mapping[float, int] | None,
+        num_steps_schedule: Schedule | None,
         rays_per_step: int,
         input_views: Sequence[int],
         target_views: Sequence[int],
@@ -104,25 +95,16 @@ class ClipDataset(Dataset[ClipSample]):
         }.items():  # fmt: skip
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
-        if num_steps_schedule and (
-            0.0 not in {float(start) for start in num_steps_schedule}
-            or not all(0.0 <= float(start) < 1.0 for start in num_steps_schedule)
-            or min(num_steps_schedule.values()) < 1
-        ):
-            raise ValueError(
-                "num_steps_schedule maps fractions of the training in [0, 1) to rollout lengths >= 1 and must say "
-                f"what holds from 0.0 on, got {dict(num_steps_schedule)}"
-            )
         self.trajectories = list(trajectories)
         self.seed, self.batch_size, self.max_steps = seed, batch_size, max_steps
-        self.num_steps, self.rays_per_step = num_steps, rays_per_step
-        self.num_steps_schedule = dict(num_steps_schedule) if num_steps_schedule else None
+        self.rays_per_step = rays_per_step
+        self.rollout_lengths = RolloutLengths(num_steps, num_steps_schedule)
         self.input_views, self.target_views = list(input_views), list(target_views)
         self.start_frames = None if start_frames is None else list(start_frames)
         self.moving_rays, self.load_future = moving_rays, load_future
         self.training_progress = training_progress
         self._moving_pixels: dict[tuple[int, int], np.ndarray] = {}
-        longest = max([num_steps, *(num_steps_schedule or {}).values()])
+        longest = self.rollout_lengths.longest
         require_clips(self.trajectories, longest, [*self.input_views, *self.target_views], self.start_frames)
 
     def __len__(self) -> int:
@@ -133,7 +115,7 @@ class ClipDataset(Dataset[ClipSample]):
 
     def __getitem__(self, item: int) -> ClipSample:
         step, sample_index = divmod(item, self.batch_size)
-        num_steps = steps_at(self._share_done(step), self.num_steps, self.num_steps_schedule)
+        num_steps = self.rollout_lengths.at(self._share_done(step), self.seed, step)
         draw = numpy_generator(self.seed, step, sample_index, "clip")
         index = int(draw.integers(len(self.trajectories)))
         trajectory = self.trajectories[index]

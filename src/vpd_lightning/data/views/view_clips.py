@@ -1,6 +1,6 @@
 """Clips of single camera views, every start frame once in an epoch: what slot models are trained on."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +9,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from vpd_lightning.data.dataset import require_clips, steps_at
+from vpd_lightning.data.dataset import require_clips
+from vpd_lightning.data.rollout_lengths import RolloutLengths, Schedule
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.views.slot_store import SlotStore
 from vpd_lightning.geometry.resizing import resize_images
@@ -58,7 +59,7 @@ class ViewClipDataset(Dataset[ViewSample]):
         max_steps: int,
         num_history: int,
         num_steps: int,
-        num_steps_schedule: Mapping[float, int] | None,
+        num_steps_schedule: Schedule | None,
         frame_offset: int,
         views: Sequence[int],
         start_frames: Sequence[int] | None,
@@ -81,12 +82,12 @@ class ViewClipDataset(Dataset[ViewSample]):
             raise ValueError(f"num_steps must not be negative, got {num_steps}")
         self.trajectories = list(trajectories)
         self.seed, self.batch_size, self.max_steps = seed, batch_size, max_steps
-        self.num_history, self.num_steps, self.num_steps_schedule = num_history, num_steps, num_steps_schedule
+        self.num_history, self.rollout_lengths = num_history, RolloutLengths(num_steps, num_steps_schedule)
         self.frame_offset, self.resolution = frame_offset, resolution
         self.views, self.cache, self.slots = list(views), cache, slots
         self.training_progress = training_progress  # of the training, where a clock ends it and not a number of steps
         # Frames of the recording from the first to the last of the longest clip.
-        span = (num_history + max([num_steps, *(num_steps_schedule or {}).values()]) - 1) * frame_offset + 1
+        span = (num_history + self.rollout_lengths.longest - 1) * frame_offset + 1
         require_clips(self.trajectories, 0, self.views, start_frames, num_context_frames=span)
         self._starts = [
             list(range(item.num_frames - span + 1)) if start_frames is None else list(start_frames)
@@ -115,7 +116,7 @@ class ViewClipDataset(Dataset[ViewSample]):
         place = self.place(step, sample_index)
         trajectory = self.trajectories[place.trajectory]
         done = step / self.max_steps if self.training_progress is None else self.training_progress()
-        count = self.num_history + steps_at(done, self.num_steps, self.num_steps_schedule)
+        count = self.num_history + self.rollout_lengths.at(done, self.seed, step)
         times = range(place.start, place.start + count * self.frame_offset, self.frame_offset)
         return ViewSample(
             images=self._images(place.trajectory, place.view, times),
