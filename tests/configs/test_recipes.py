@@ -146,6 +146,13 @@ def test_the_words_of_a_person_win_over_model_and_size() -> None:
     assert forward["data"]["batch_size"] == 4
 
 
+def test_a_schedule_on_the_command_line_replaces_that_of_the_recipe_whole() -> None:
+    words = ["model=vpd_staged", "budget=hour", "experiment=mujoco_block"]
+    assert set(compose("train", words)["data"]["num_steps_schedule"]) == {0.0, 0.3, 0.75}
+    config = compose("train", [*words, "data.num_steps_schedule={0.0:2,0.5:[1,8]}"])
+    assert config["data"]["num_steps_schedule"] == {0.0: 2, 0.5: [1, 8]}
+
+
 def test_settings_of_a_stage_in_an_experiment_of_ones_own_are_refused(lab: Path) -> None:
     path = lab / "experiment" / "shelf.yaml"
     path.write_text(path.read_text() + "encoder:\n  num_particles: 77\n")

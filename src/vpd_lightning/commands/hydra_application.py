@@ -128,12 +128,13 @@ def run_hydra(command: str, argv: Sequence[str], task: Callable[[Any], Any]) -> 
     import hydra
 
     from vpd_lightning.config import config_folder
-    from vpd_lightning.config.composing import plugin_search_path, prepare
+    from vpd_lightning.config.composing import plugin_search_path, prepare, whole_schedules
 
     # Hydra's parser takes settings in one run of words only, and plug-ins add one: flags go in front.
     arguments = parse_arguments(argv)
     prepare(arguments.config_dir, arguments.overrides)
-    words = [*arguments.flags, *arguments.overrides, *plugin_search_path(arguments.overrides)]
+    overrides = whole_schedules(arguments.overrides)
+    words = [*arguments.flags, *overrides, *plugin_search_path(arguments.overrides)]
     with _command_line(f"vpd-{command}", words):
         try:
             hydra.main(config_path=str(config_folder()), config_name=command, version_base="1.3")(task)()

@@ -180,7 +180,7 @@ def _compose(command: str, overrides: Sequence[str], config_dir: str | Path | No
 @contextmanager
 def initialized(overrides: Sequence[str], config_dir: str | Path | None) -> Iterator[list[str]]:
     """Initialize Hydra and yield the words for it; leaves a Hydra that is already running (a job of its own) alone."""
-    words = [*overrides, *_search_path(option_folders(config_dir), overrides)]
+    words = [*whole_schedules(overrides), *_search_path(option_folders(config_dir), overrides)]
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
@@ -211,6 +211,19 @@ def option_folders(config_dir: str | Path | None, overrides: Sequence[str] = ())
                 "The stages of a model at one size, and how they are trained, are set in recipe/SIZE/MODEL.yaml."
             )
     return folders
+
+
+def whole_schedules(overrides: Sequence[str]) -> list[str]:
+    """Return the words with a schedule set to null before each that gives one.
+
+    Hydra merges a mapping with the one that is there already: entries of the recipe's schedule would stay between those
+    of the command line, or be refused.
+    """
+    words = []
+    for word in overrides:
+        key, _, value = word.partition("=")
+        words += [f"{key}=null", word] if key.endswith(".num_steps_schedule") and "{" in value else [word]
+    return words
 
 
 def plugin_search_path(overrides: Sequence[str]) -> list[str]:
