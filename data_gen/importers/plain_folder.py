@@ -35,7 +35,7 @@ taken at the same moment. ``cameras.json``::
 
 ``K``, ``fx`` ..., and the pose may be lists with one entry per frame, for cameras that move or zoom. A view may have an
 ``axes``, ``pixel_center``, ``depth_type`` or ``depth_unit`` of its own. The conventions have no default values, because
-a wrong one spoils a data set without a word; ``vpd-data validate`` tells from the data whether they fit.
+a wrong one spoils a data set without a word; ``vpd-data validate`` checks against the data whether they fit.
 
 Depth is in the colour camera's frame. A depth image of another size but the same field of view (phones) is fitted
 to colour.

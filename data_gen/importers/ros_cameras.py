@@ -166,7 +166,7 @@ def _suffix(topic: str) -> str:
 
 
 def _misalignment(colour: ImageTopic, depth: ImageTopic) -> str | None:
-    """Say why depth cannot be aligned to colour, as far as sizes and frames tell."""
+    """Say why depth cannot be aligned to colour, as far as sizes and frames show."""
     if (colour.height, colour.width) != (depth.height, depth.width):
         return f"depth is not aligned to colour: {colour} and {depth} differ in size"
     if colour.frame != depth.frame:

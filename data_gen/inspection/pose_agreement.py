@@ -1,4 +1,4 @@
-"""Whether cameras of one moment stand where their poses say, told from surfaces that two of them see.
+"""Whether cameras of one moment stand where their poses say, estimated from surfaces that two of them see.
 
 Noise hides a wrong pose from single points, and not from all of them together: the points of one view are moved
 rigidly onto the surfaces that another view sees there (point to plane, Chen and Medioni 1992, one linear step), and how
@@ -109,7 +109,7 @@ def _misplacement(
 
 
 def _motion(motions: Array, residuals: Array) -> tuple[Array, Array, Array]:
-    """Return the least-squares motion along independent axes (metres), how many points tell of each, and the axes."""
+    """Return the least-squares motion along independent axes (metres), how many points constrain each, and the axes."""
     values, axes = np.linalg.eigh(motions.T @ motions)
     known = values > _TELLING
     values, axes = values[known], axes[:, known]

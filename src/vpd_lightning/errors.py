@@ -54,6 +54,6 @@ class NonFiniteError(VPDError):
 
 
 def one_line(error: BaseException, limit: int = 200) -> str:
-    """Return what another library said, as one line of at most ``limit`` characters: some say pages."""
+    """Return another library's message as one line of at most ``limit`` characters: some fill pages."""
     text = " ".join(str(error).split())
     return text if len(text) <= limit else f"{text[: limit - 3]}..."

@@ -23,7 +23,7 @@ from vpd_lightning.types import Particles, RGBDFrames, SimulatorOutput, VideoBat
 
 @runtime_checkable
 class _OffersPointFeatures(Protocol):
-    """A renderer whose input features can be asked for at any point."""
+    """A renderer whose input features can be queried at any point."""
 
     num_neighbors: int
     kernel_radii: tuple[float, ...]

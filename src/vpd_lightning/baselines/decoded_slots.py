@@ -1,4 +1,4 @@
-"""What the decoder says of a set of slots."""
+"""What the decoder predicts from a set of slots."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Dropout that draws from the keys of a batch: PyTorch's own layers know the global generator only."""
+"""Dropout that draws from the keys of a batch: PyTorch's own layers draw from the global generator only."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

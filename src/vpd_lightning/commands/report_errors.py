@@ -35,7 +35,7 @@ def run_command(function: Callable[[], int | None]) -> int:
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output (head, less) went away: nobody is left to tell. Python would complain at exit.
+        # The reader of our output (head, less) went away. Python would complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     finally:

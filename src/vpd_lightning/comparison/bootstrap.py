@@ -95,7 +95,7 @@ def step_band(samples: MetricSamples, num_bootstrap: int) -> Float[np.ndarray, "
 
 
 def difference(first: MetricSamples, second: MetricSamples, num_bootstrap: int) -> tuple[Estimate, int] | None:
-    """Estimate first minus second over the steps of trajectories that both know, and the number of trajectories.
+    """Estimate first minus second over the steps of trajectories that both have, and the number of trajectories.
 
     The same trajectories are drawn for both, because both saw the same clips: what makes a clip hard for both does not
     widen the interval. Seeds are drawn for each by itself.

@@ -115,7 +115,7 @@ def _table(table: ComparisonTable, files: TableFiles) -> list[str]:
         lines += ["### Who is best", "", *best, ""]
     paired = differences_table(table)
     if paired:
-        words = "Mean differences on the same trajectories, with their intervals; one that holds 0 tells nothing apart."
+        words = "Mean differences on the same trajectories, with their intervals; one that holds 0 shows no difference."
         lines += ["### Paired differences", "", words, "", *paired, ""]
     settings = settings_table(table)
     if settings:

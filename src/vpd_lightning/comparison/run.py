@@ -1,4 +1,4 @@
-"""One evaluated training, as its folder tells it."""
+"""One evaluated training, read from its folder."""
 
 import json
 import zipfile
@@ -66,7 +66,7 @@ class Run:
         digest = (self.metrics.get("training") or {}).get("data_sha256")
         if digest is not None:
             return bool(digest != self.data_sha256)
-        # Older checkpoints do not say; then the folder tells.
+        # Older checkpoints hold no digest; then folders are compared.
         trained, evaluated = _get(self.config, "data.folder"), self.metrics.get("data")
         if not isinstance(trained, str) or not isinstance(evaluated, str):
             return False

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SYSTEM_PACKAGES = ("vpd_lightning",)  # a system and its parts, whose description may come from anywhere
 ALLOWED_PACKAGES = (*SYSTEM_PACKAGES, "torch.optim", "lightning.pytorch")
 WORDS_OF_OUR_OWN = {"trainer.precision": "auto"}
-"""Values that the class does not know: the command puts another in their place before it is built."""
+"""Values that no class takes: the command replaces them before anything is built."""
 _REFERENCE = "${"
 STAGES = {
     "encoder": ("vpd_lightning.encoder.base", "AbstractEncoder"),

@@ -1,4 +1,4 @@
-"""What Hydra and OmegaConf say, said so that a person can act on it."""
+"""Errors of Hydra and OmegaConf, rewritten so that a person can act on them."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence

@@ -32,7 +32,7 @@ def busy_error(path: Path, error: BaseException) -> BrokenFileError | None:
 
 
 def _programs(path: Path, *, writing: bool) -> list[str]:
-    """Name the processes that have a file open (for writing), as far as this system tells (Linux does)."""
+    """Name the processes that have a file open (for writing), where the system lists them (Linux does)."""
     wanted = str(path.resolve())
     try:
         processes = [name for name in os.listdir("/proc") if name.isdigit()]

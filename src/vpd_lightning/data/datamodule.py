@@ -32,8 +32,8 @@ class VideoDataModule(pl.LightningDataModule):
     that leaves room for the clip; ``num_trajectories`` null means the whole training split. ``num_steps_schedule``
     maps fractions of the training to rollout lengths, or to lists of which every update draws one, and overrides
     ``num_steps`` in training (null: no schedule); fractions are of ``trainer.max_steps``, or of the time where
-    ``training_progress`` is set (``callbacks.time_budget``). ``moving_ray_fraction`` of the rays goes to pixels that differ from the per-camera
-    training median by more than the thresholds (largest colour channel, in [0, 1]; depth, in metres), or lie within
+    ``training_progress`` is set (``callbacks.time_budget``). ``moving_ray_fraction`` of the rays goes to pixels that
+    differ from the per-camera training median by more than the thresholds (largest colour channel, in [0, 1]; depth, in metres), or lie within
     ``moving_ray_margin`` pixels of one that does. With ``cache`` decoded frames stay in memory (in each loader worker;
     with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
     the input views' images of the frames to predict. ``sensor`` names a simulated sensor (``conf/sensor``) whose errors

@@ -65,8 +65,8 @@ class ClipDataset(Dataset[ClipSample]):
     context, and rays of frames ``start + 2 ... start + 1 + T`` of the target views with the colours seen along them.
     With ``load_future`` the input views' images of those frames come too.
 
-    ``training_progress`` is asked how much of the training is done, where a clock ends it and ``max_steps`` does not
-    tell.
+    ``training_progress`` returns the share of the training that is done, where a time budget ends it instead of
+    ``max_steps``.
     """
 
     def __init__(

@@ -49,7 +49,7 @@ class Manifest:
         return self.splits[name]
 
     def checksums(self, paths: Iterable[Path]) -> list[str]:
-        """Return the SHA-256 of some of its files: what tells a trajectory, whatever its name or folder."""
+        """Return the SHA-256 of some of its files: what identifies a trajectory, whatever its name or folder."""
         return [self.sha256[self.relative(path)] for path in paths]
 
     @property

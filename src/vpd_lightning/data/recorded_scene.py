@@ -1,4 +1,4 @@
-"""What recordings say about their scene: cameras, workspace, and lengths that fit its distance and the frame rate.
+"""Cameras, workspace and lengths of a scene, read from its recordings; lengths fit its distance and frame rate.
 
 Lengths that nobody measured follow from how far off the scene is and how fast things fall. The factors lie near the
 means over the scenes whose lengths were chosen by hand (tossed block from 1.9 and 2.6 m, MOVi

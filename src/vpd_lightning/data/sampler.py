@@ -12,7 +12,7 @@ class StepBatchSampler(Sampler[list[int]]):
     """Yields this rank's slice of the global batch, step after step, from the current step on.
 
     Rank r of W takes samples r * B / W ... (r + 1) * B / W - 1 of a global batch of B, so that one rank with 16 samples
-    and 16 ranks with one sample train on the same clips. ``first_step`` is asked when iteration begins: a resumed run
+    and 16 ranks with one sample train on the same clips. ``first_step`` is called when iteration begins: a resumed run
     goes on where it stopped. The length counts all steps, those already done included, as Lightning's own counter does.
     """
 

@@ -64,7 +64,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
     or ``r_a_s``): the same functions, from inputs of order one whatever the scene's unit of length. ``edge_gain``
     multiplies those between particles and abstract nodes: velocity shows as a shift by a fraction of ``r_s``.
 
-    ``aggregation`` says how edges are brought together at a node: their ``sum``, or their ``mean``, whose size does not
+    ``aggregation`` reduces the edges at a node: their ``sum``, or their ``mean``, whose size does not
     depend on how many particles lie around a node.
 
     Without ``update_features`` there is no feature decoder, and particles keep the features that they were encoded
@@ -352,7 +352,7 @@ def static_step(
     previous_tensors: tuple[Tensor, Tensor, Tensor],
     current_tensors: tuple[Tensor, Tensor, Tensor],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Take one step with fixed shapes; positions, features and masks in, because tensors are what compilers know.
+    """Take one step with fixed shapes; positions, features and masks in, because compilers trace tensors alone.
 
     Returns positions, features, the share of uncovered particles, the edges dropped and the particles not finite.
     """

@@ -22,7 +22,7 @@ _MIN_PARTICLES = 8
 """Fewer particles are no cluster."""
 
 _MIN_PLANE_SHARE = 0.2
-"""A plane through at least this share of all particles is scenery (where nothing else tells what is)."""
+"""A plane through at least this share of all particles is scenery (where no mask of scenery is given)."""
 
 _MAX_PLANES = 3
 

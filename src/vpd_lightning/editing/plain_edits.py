@@ -64,7 +64,7 @@ def selector_from(plain: Any, where: str, depth: int = 0) -> Selector:
     """Return the selector that plain values describe.
 
     Raises:
-        EditError: they describe none; ``where`` says where they stand.
+        EditError: they describe none; ``where`` names their place in the file.
     """
     if depth > MAX_DEPTH:
         raise EditError(f"{where} is nested more than {MAX_DEPTH} deep.")

@@ -1,4 +1,4 @@
-"""What is selected, said so that it can be stored and said again of another scene: regions, colours, clusters, sets."""
+"""Selections of particles that can be stored and applied to another scene: regions, colours, clusters, sets."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -178,7 +178,7 @@ class Cluster(Selector):
 
 @dataclass(frozen=True)
 class Slots(Selector):
-    """Particles by number, of this one scene: a mask. It cannot be said of another scene, nor stored for one."""
+    """Particles by number, of this one scene: a mask. It can neither be stored nor applied to another scene."""
 
     chosen: Bool[Tensor, " particle"]
 

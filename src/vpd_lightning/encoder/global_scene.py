@@ -63,7 +63,7 @@ class GlobalSceneEncoder(AbstractEncoder):
             nn.Linear(hidden_dim, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, feature_dim)
         )
         for module in (self.image_head, *self.view_network, *self.state_network):
-            if isinstance(module, nn.Linear):  # He et al. 2015: what tells images apart is as large behind as before
+            if isinstance(module, nn.Linear):  # He et al. 2015: keeps the variance of activations
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)
 

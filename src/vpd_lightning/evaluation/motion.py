@@ -1,4 +1,4 @@
-"""Predicted particles beside ground truth: the metrics alone know the true poses, the model never does."""
+"""Predicted particles beside ground truth: only the metrics read the true poses."""
 
 from collections.abc import Sequence
 

@@ -22,10 +22,10 @@ _MIN_SHARE = 0.03
 """Share of all points that a plane must hold."""
 
 _NUM_BINS, _MIN_IN_BIN = 24, 20
-"""Distances in which bias and noise of a plane are found anew, and pixels that say so."""
+"""Bins of distance in which bias and noise of a plane are estimated, and the fewest pixels for an estimate."""
 
 _MOVING_COST = 3.4
-"""Cost of saying that a pixel is on no plane, in nats: on its own it must be 2.6 standard deviations off."""
+"""Cost of labelling a pixel as on no plane, in nats: on its own it must be 2.6 standard deviations off."""
 
 _MAX_COST = 12.0
 _COUPLING = 1.2
@@ -105,8 +105,8 @@ def off_wide_planes(
     Planes are fitted by RANSAC to the points of all views together; one counts where it holds many points and reaches
     ``min_width`` of the diagonal of all that is seen. For each plane, view and distance its bias and noise are found
     anew: at grazing angles a sensor errs by more than it scatters. How many standard deviations a pixel lies off its
-    nearest plane, and what its neighbours say (mean field of a Potts model), decides. ``rays`` are one unit along the
-    optical axis, in the world; ``noise`` is a share of depth (``relative_noise``), and so is ``pixel_sizes``, what a
+    nearest plane, and the labels of its neighbours (mean field of a Potts model), decide. ``rays`` are one unit along
+    the optical axis, in the world; ``noise`` is a share of depth (``relative_noise``), and so is ``pixel_sizes``, what a
     pixel covers.
     """
     views = _Views(depth.astype(np.float64), rays.astype(np.float64), centers.astype(np.float64), valid)

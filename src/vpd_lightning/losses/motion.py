@@ -43,7 +43,7 @@ class MotionLoss(AbstractLoss):
         """Return the mean over steps and scales.
 
         Raises:
-            ConfigError: the batch holds no future frames, or the encoder does not tell what may move.
+            ConfigError: the batch holds no future frames, or the encoder gives no mask of what may move.
         """
         first = output.states[0]
         if "future_positions" not in output.auxiliary or first.moving is None or first.colors is None:

@@ -66,7 +66,7 @@ def resized(cameras: Cameras, height: int | None, width: int | None) -> Cameras:
 
 
 def read_camera_file(path: Path) -> tuple[Cameras, bool]:
-    """Read cameras from JSON; also tells whether they are the places of one moving camera.
+    """Read cameras from JSON, and whether they are the poses of one moving camera.
 
     ``{"height": H, "width": W, "moving": false, "cameras": [{"intrinsics": 3x3 pixels, "cam_to_world": 4x4 metres}]}``,
     or a camera path of nerfstudio (see ``nerfstudio_paths``), whose camera always moves.

@@ -15,7 +15,7 @@ def to_graph_data(particles: Particles, *, edge_radius: float | None) -> Data:
     """Return particles as a ``Data``, or as a ``Batch`` of one for each member where there is a batch axis.
 
     ``pos`` (node, 3) are the positions in metres, ``x`` the features; ``colors``, ``moving`` and ``normals`` are there
-    where the particles have them. Padding is left out: ``slot`` tells where each node stood in the padded table, and
+    where the particles have them. Padding is left out: ``slot`` is the index of each node in the padded table, and
     ``num_slots`` how long that was, so that ``from_graph_data`` gives the same table again.
 
     With ``edge_radius`` (metres) ``edge_index`` joins particles that are no farther apart, both ways and none with

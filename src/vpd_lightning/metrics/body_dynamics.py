@@ -22,7 +22,7 @@ def best_rotation(
 def orientation_error(
     pred: Float[Tensor, "step particle 3"], true: Float[Tensor, "step particle 3"], start: Float[Tensor, "particle 3"]
 ) -> Float[Tensor, " step"]:
-    """Angle in degrees between the rotations since ``start`` that particles and their true places tell."""
+    """Angle in degrees between the rotations since ``start`` of the particles and of their true positions."""
     relative = best_rotation(start, pred).mT @ best_rotation(start, true)
     skew = torch.stack([relative[:, i, j] - relative[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1).norm(dim=-1)
     trace = relative.diagonal(dim1=-2, dim2=-1).sum(-1)

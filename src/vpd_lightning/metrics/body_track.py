@@ -55,7 +55,7 @@ class BodyTrack:
 
     @property
     def is_soft(self) -> bool:
-        """Whether it changes its shape, so that nothing about rigid motion is said of it."""
+        """Whether it changes its shape, so that metrics of rigid motion do not apply."""
         return self.surface is not None
 
     @property

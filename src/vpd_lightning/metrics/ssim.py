@@ -15,7 +15,7 @@ _C1, _C2 = 0.01**2, 0.03**2  # of values in [0, 1]
 
 @dataclass(frozen=True)
 class LocalMoments:
-    """What SSIM needs to know of images: their values, and mean and variance in the Gaussian window of each pixel.
+    """What SSIM needs of images: their values, and mean and variance in the Gaussian window of each pixel.
 
     ``centred`` are the values less ``center``, the mean of the channel: squares of small numbers lose fewer digits when
     one is taken from the other, and variances stay the same.

@@ -15,7 +15,7 @@ _NUM_CANDIDATES = 16  # triangles with the nearest centres; the nearest triangle
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points of a surface: ``weights`` of the corners of a ``triangle``; ``distance`` (m) is that to what was asked."""
+    """Points of a surface: ``weights`` of the corners of a ``triangle``; ``distance`` (m) is to the query point."""
 
     triangle: Int64[np.ndarray, " point"]
     weights: Float64[np.ndarray, "point 3"]

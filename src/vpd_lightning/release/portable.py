@@ -7,7 +7,7 @@ from typing import Any
 from vpd_lightning.errors import ConfigError
 
 _OF_THE_RUN = ("run", "logger", "debug", "force", "resume", "num_threads", "sweep_name", "evaluate")
-"""Root entries that say where and how a run ran, and nothing of what was trained."""
+"""Root entries about where and how a run ran, not about what was trained."""
 
 _BUILT = ("model", "encoder", "dynamics", "renderer")
 """Sections that the system is built from: nothing may silently go there."""

@@ -219,7 +219,7 @@ def float32_weights(system: nn.Module) -> dict[str, Tensor]:
 
 
 def system_name(config: Mapping[str, Any]) -> str:
-    """Return the configuration's ``system``; runs from before it had a name tell it by their dynamics."""
+    """Return the configuration's ``system``; for runs from before it had a name, from their dynamics."""
     if "system" in config:
         return str(config["system"])
     dynamics = config.get("dynamics") or {}

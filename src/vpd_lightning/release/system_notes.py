@@ -1,4 +1,4 @@
-"""What reports and model cards know of each system: one entry for each, in the order of the paper's table."""
+"""Names and notes of each system for reports and model cards: one entry for each, in the order of the paper's table."""
 
 from dataclasses import dataclass
 

@@ -102,8 +102,8 @@ class UnseenGround(nn.Module):
     """What the ground looks like where no input camera saw it: a guess, learned from cameras that did.
 
     A network of the place where the ray meets the plane (contracted beyond ``length`` metres, as in mip-NeRF 360) and
-    of the ray's direction says how it differs from the mean colour of the ground that was seen. Before training it
-    does not.
+    of the ray's direction predicts its difference from the mean colour of the ground that was seen. Before training
+    that is zero.
     """
 
     def __init__(self, *, frequencies: int, hidden_dim: int, length: float, near: float):

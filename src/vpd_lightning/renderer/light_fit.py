@@ -72,7 +72,7 @@ def light_pair(
     still = still[torch.randperm(len(still), generator=generator)[:_NUM_RAYS].to(still.device)]
     lines = Rays(rays.origins[still][None], rays.directions[still][None])
     seen = renderer.scenery(before.scenery, lines)
-    # A ray that meets something else now and then (what a body hid, another surface) says nothing of light.
+    # A ray that meets something else now and then (what a body hid, another surface) shows nothing of the light.
     depth = (after.scenery.positions[0][still] - lines.origins[0]).norm(dim=-1)
     same = (seen.opacities[0] > 0.9) & ((seen.distances[0] - depth).abs() < 3 * after.scenery.sizes[0][still])
     changed = ((colors[still] - seen.colors[0]).abs().amax(dim=-1) > _MIN_CHANGE) & same

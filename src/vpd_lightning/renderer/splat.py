@@ -20,7 +20,7 @@ from vpd_lightning.renderer.shadows import Shadows
 from vpd_lightning.types import Occluders, Particles, Rays, RenderedRays, Scenery, require_finite
 
 _GROUND_LENGTH = 20.0
-"""Surface scales within which a place on the ground is told from others; beyond, less and less."""
+"""Surface scales over which the ground network resolves positions; farther out they are contracted."""
 
 
 class _Layers(NamedTuple):

@@ -81,7 +81,7 @@ def run_sweep(jobs: Sequence[SweepJob], train: Callable[[list[str]], None], show
     Args:
         jobs: what belongs to the sweep.
         train: trains with the words given, or raises.
-        show: tells the user of an error.
+        show: reports an error to the user.
     """
     statuses: dict[str, str] = {}
     codes: list[int] = []

@@ -99,8 +99,8 @@ def assert_same(actual: Any, expected: Any, tolerance: float = 0.0) -> None:
 
 
 @contextmanager
-def said(what: str) -> Iterator[None]:
-    """Say in which case a check fails.
+def describe_case(what: str) -> Iterator[None]:
+    """Name the case in which a check fails.
 
     Raises:
         AssertionError: of the check, with the case before its text.
@@ -168,13 +168,13 @@ def global_randomness_untouched() -> Iterator[None]:
     before = (torch.get_rng_state(), np.random.get_state())
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     yield
-    said = "changes global random state; draw from keys.generators(purpose) instead"
-    assert torch.equal(before[0], torch.get_rng_state()), f"the component {said} (torch)"
+    fault = "changes global random state; draw from keys.generators(purpose) instead"
+    assert torch.equal(before[0], torch.get_rng_state()), f"the component {fault} (torch)"
     after = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
-    assert all(torch.equal(a, b) for a, b in zip(cuda, after, strict=True)), f"the component {said} (torch.cuda)"
+    assert all(torch.equal(a, b) for a, b in zip(cuda, after, strict=True)), f"the component {fault} (torch.cuda)"
     now = np.random.get_state()
     same = all(np.array_equal(a, b) for a, b in zip(before[1], now, strict=True))  # type: ignore[arg-type]
-    assert same, f"the component {said} (numpy)"
+    assert same, f"the component {fault} (numpy)"
 
 
 def disturb_global_randomness() -> None:

@@ -15,10 +15,10 @@ from vpd_lightning.testing.contract import (
     assert_gradients,
     assert_precision,
     assert_same,
+    describe_case,
     disturb_global_randomness,
     global_randomness_untouched,
     may_depart,
-    said,
     summed,
     unchanged,
 )
@@ -103,7 +103,7 @@ class DynamicsContract(Contract):
         plain = self.roll(dynamics, previous, current)[-1]
         for where, padded in sets.PADDINGS.items():
             wide = self.roll(dynamics, padded(previous), padded(current))[-1]
-            with said(f"with padding {where}"):
+            with describe_case(f"with padding {where}"):
                 assert_same(_valid(sets.without_padding(wide)), _valid(plain), self.tolerance)
 
     @may_depart

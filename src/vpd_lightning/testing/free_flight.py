@@ -1,7 +1,7 @@
 """Balls in free flight over a floor: RGB-D video whose motion is known, drawn in memory. Metres, z up, float32.
 
 What a dynamics must be able to learn before anything else: each ball has a velocity of its own, which only the
-difference of the two context frames tells.
+difference of the two context frames shows.
 """
 
 from dataclasses import dataclass

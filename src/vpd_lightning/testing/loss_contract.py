@@ -12,9 +12,9 @@ from vpd_lightning.testing.contract import (
     Contract,
     assert_finite,
     assert_same,
+    describe_case,
     global_randomness_untouched,
     may_depart,
-    said,
     tensors_of,
     unchanged,
 )
@@ -81,7 +81,7 @@ class LossContract(Contract):
         output = self.output(batch)
         plain = loss(output, batch)
         for where, padded in sets.PADDINGS.items():
-            with said(f"with padding {where}"):
+            with describe_case(f"with padding {where}"):
                 wide = replace(output, states=[padded(state) for state in output.states])
                 assert_same(loss(wide, batch), plain, self.tolerance)
 

@@ -13,10 +13,10 @@ from vpd_lightning.testing.contract import (
     assert_gradients,
     assert_precision,
     assert_same,
+    describe_case,
     disturb_global_randomness,
     global_randomness_untouched,
     may_depart,
-    said,
     summed,
     unchanged,
 )
@@ -78,7 +78,7 @@ class RendererContract(Contract):
         for keys in (None, keys_for(2)):
             plain = renderer(particles, rays, keys)
             for where, padded in sets.PADDINGS.items():
-                with said(f"with padding {where}"):
+                with describe_case(f"with padding {where}"):
                     assert_same(renderer(padded(particles), rays, keys), plain, self.tolerance)
 
     @may_depart

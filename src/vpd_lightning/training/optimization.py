@@ -55,8 +55,8 @@ class AbstractOptimization(ABC):
     def build(self, simulator: nn.Module, max_steps: int | Callable[[], int]) -> tuple[torch.optim.Optimizer, LambdaLR]:
         """Return the optimiser and its schedule, to be stepped after every update.
 
-        ``max_steps`` is asked again for every update where it is a function: a training that ends after a given time
-        learns how many updates that allows.
+        ``max_steps`` is called again for every update where it is a function: a training that ends after a given time
+        estimates how many updates that allows.
 
         Stages are the direct children of the simulator; a stage without a multiplier has 1. Raises ValueError where a
         multiplier other than 1 names no stage.

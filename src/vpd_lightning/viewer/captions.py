@@ -1,4 +1,4 @@
-"""What is said beside the picture: one sentence about it, and the figures of the step."""
+"""The text beside the picture: one sentence about it, and the figures of the step."""
 
 from vpd_lightning.metrics.registry import CHAMFER, PSNR, metric
 from vpd_lightning.viewer.screen import PARTICLES, PICTURE, Screen

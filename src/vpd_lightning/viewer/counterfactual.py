@@ -1,4 +1,4 @@
-"""What MuJoCo says of an edited scene, where its recording can be simulated anew."""
+"""MuJoCo's own simulation of an edited scene, where its recording can be simulated anew."""
 
 from collections.abc import Sequence
 

@@ -32,7 +32,7 @@ _MAX_ROWS = 720  # of what is sent to the browser
 _NARROW, _FREE_OF_PANEL = 576, 0.4
 """A canvas of so few columns (CSS pixels) is a telephone's: the panel lies over all but this share at its top."""
 
-_UNKNOWN_SIZE = (720, 960)  # of a browser that did not say how large it is
+_UNKNOWN_SIZE = (720, 960)  # of a browser that reports no size
 
 
 class Screen:

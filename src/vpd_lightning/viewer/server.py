@@ -33,7 +33,7 @@ class _LeftPage:
 
 
 class Viewer:
-    """A running viewer; ``url`` holds the token. It says what it loads until ``show`` gives it a scene.
+    """A running viewer; ``url`` holds the token. It shows what is being loaded until ``show`` gives it a scene.
 
     A page that is reloaded finds its edits again. With ``kiosk`` seconds, a page that nobody touched for so long begins
     again as on the first visit.
@@ -50,7 +50,7 @@ class Viewer:
         self.server: viser.ViserServer = start_guarded_server(port, token, "VPD")
         self.port = self.server.get_port()
         self.url = f"http://{HOST}:{self.port}/?token={token}"
-        # A page may be left at any time; what is said to it afterwards is lost, as it should be.
+        # A page may be left at any time; messages sent to it afterwards are lost, as they should be.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()

@@ -32,7 +32,7 @@ class Session:
         self.opened = opened
         self.lock = threading.RLock()
         self.now = opened.rollout
-        self._editor = self.now.editor  # knows what was undone; that of the unedited scene is everybody's
+        self._editor = self.now.editor  # holds the undo history; that of the unedited scene is shared by all
         self.kept: Rollout | None = None
         self.selector: Selector | None = None
         self._generation = 0

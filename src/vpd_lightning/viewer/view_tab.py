@@ -1,4 +1,4 @@
-"""The tab that says what is shown, and how."""
+"""The tab with what is shown, and how."""
 
 from typing import Any
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from vpd_lightning.data.dataset import require_clips
-from vpd_lightning.data.rollout_lengths import RolloutLengths, Schedule
 from vpd_lightning.data.frames import TrajectoryFrames
+from vpd_lightning.data.rollout_lengths import RolloutLengths, Schedule
 from vpd_lightning.data.views.slot_store import SlotStore
 from vpd_lightning.geometry.resizing import resize_images
 from vpd_lightning.randomness import RandomKeys, numpy_generator

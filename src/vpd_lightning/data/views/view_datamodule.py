@@ -1,4 +1,4 @@
-"""The data of systems that know single camera views only: clips of them, and the slots they are stored as."""
+"""The data of systems that take single camera views only: clips of them, and the slots they are stored as."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

@@ -367,7 +367,7 @@ def _carried(motion: BodyMotion, positions: Tensor, own: Tensor) -> Float[Tensor
 def _first_motion(positions: Tensor, displacements: Tensor, shares: Tensor, centers: Tensor) -> BodyMotion:
     """Return the motion that the bodies arrived with: rigid, about their own centres."""
     fitted = fit_twists(positions, displacements, shares)
-    # Fitted centres are those after the step, so the way back tells where each centre came from.
+    # Fitted centres are those after the step; turning back gives where each centre was before it.
     back = rotate(rotation_from_spin(-fitted.spins), centers - fitted.centers)
     eye = torch.eye(3, dtype=positions.dtype, device=positions.device).expand(*centers.shape, 3)
     there = (shares.sum(dim=-1) > 0)[..., None]

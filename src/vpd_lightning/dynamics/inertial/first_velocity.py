@@ -156,7 +156,7 @@ class FirstVelocity(nn.Module):
         return cost
 
     def _variety(self, colors: Tensor, members: Tensor) -> Float[Tensor, "batch body"]:
-        """Return from 0 (a body of one colour) to 1 how much colours say about places on a body."""
+        """Return from 0 (a body of one colour) to 1 how well colours identify points of a body."""
         shares = members / members.sum(dim=2, keepdim=True).clamp(min=1)
         tone = chromaticity(colors)[..., :3]
         spread = weighted_sum(shares, tone.square()).sum(-1) - weighted_sum(shares, tone).square().sum(-1)

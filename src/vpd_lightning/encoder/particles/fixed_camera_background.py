@@ -12,8 +12,8 @@ from vpd_lightning.types import Cameras, RGBDFrames
 class BackgroundModel(AbstractBackground):
     """Marks pixels that lie nearer than the training-median depth of the same camera.
 
-    Uses no labels, but fixed cameras. Depth, unlike colour, tells bodies from their shadows. The median images live in
-    the state dict.
+    Uses no labels, but fixed cameras. Depth, unlike colour, separates bodies from their shadows. The median images
+    live in the state dict.
     """
 
     # Paper: not in the paper; it gives the inertial dynamics its candidates for motion.

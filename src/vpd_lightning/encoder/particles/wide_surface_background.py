@@ -24,7 +24,7 @@ class WideSurfaceBackground(AbstractBackground):
     ``min_width`` (a share of all that is seen) how wide, ``tolerance`` (in pixels) how close to a surface is on it.
 
     Where depth scatters by more than ``noise_floor`` (a share of it, found from the frame itself, camera by camera;
-    null: never looked at) normals of neighbouring pixels say nothing, and planes fitted to all views take the place of
+    null: never looked at) normals of neighbouring pixels are unreliable, and planes fitted to all views replace
     surfaces: see ``geometry.noisy_planes``. Below it nothing is different from a perfect sensor.
 
     The masks of the last ``memory_frames`` time steps are kept, in packed bits, by a digest of depth and cameras: a

@@ -11,7 +11,7 @@ from vpd_lightning.renderer.field.precision import at_least_float32, full_precis
 class FeatureNetwork(nn.Module):
     """``F(z, (x - p) / s)``: from a latent feature and a scaled offset to a feature of the same width.
 
-    The paper (appendix "Feature Encoding Experiments") takes it from PointNeRF (Xu et al. 2022), and says nothing of
+    The paper (appendix "Feature Encoding Experiments") takes it from PointNeRF (Xu et al. 2022), and does not mention
     its size. The offset is encoded by ``offset_degree`` frequencies; hidden layers have ReLU, the last one nothing
     behind it. At 16 features, width 64, two hidden layers and degree 5: (16 + 33) * 64 + 64, 64 * 64 + 64 and
     64 * 16 + 16, 8,400 parameters in all.

@@ -15,7 +15,7 @@ from vpd_lightning.types import Particles
 
 
 class SampleFeatures:
-    """The particles of a batch, made ready once and then asked for the features of many locations.
+    """The particles of a batch, prepared once and then queried at many locations.
 
     ``max_radius`` (metres, ``None``: no limit) leaves out what is farther, see ``bounds.feature_error_bound``.
     ``is_checkpointed`` keeps, of all that lies between particles and features, only the neighbours' indices for the

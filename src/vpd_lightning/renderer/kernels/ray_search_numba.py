@@ -84,7 +84,7 @@ def search(
     num_rays = origins.shape[1]
     num_slices = max(1, min(_MAX_SLICES, num_rays // _MIN_SLICE))
     bounds = [num_rays * part // num_slices for part in range(num_slices + 1)]
-    # A point of each ray tells how near rays are to each other, for cameras that are some way apart.
+    # One point on each ray measures how near rays are to each other, for cameras that are some way apart.
     orders = [morton_order(o + d).numpy() for o, d in zip(origins, directions, strict=True)]
     o, d = origins.contiguous().numpy(), directions.contiguous().numpy()
     indices, masks = index.numpy(), mask.numpy()

@@ -13,7 +13,7 @@ from vpd_lightning.training.module import VPDModule
 
 FILE = "training_time.json"
 _FIRST_GUESS = 10  # updates before the measured pace says how many there will be
-_WARM_UP = 3  # updates after a start that compile and fill caches: they count, but do not tell the pace
+_WARM_UP = 3  # updates after a start that compile and fill caches: they count, but are left out of the pace
 
 
 class TimeBudget(pl.Callback):
@@ -171,6 +171,6 @@ class TimeBudget(pl.Callback):
         """Go on counting."""
         self.seconds, self._steps = float(state_dict["seconds"]), int(state_dict["steps"])
         self.seconds_before = float(state_dict["seconds_before"])
-        # Checkpoints from before the pace was kept apart: all updates tell it.
+        # Checkpoints from before the pace was kept apart: the mean over all updates.
         self._paced_seconds = float(state_dict.get("paced_seconds", self.seconds))
         self._paced_steps = int(state_dict.get("paced_steps", self._steps))
