@@ -29,13 +29,13 @@ class VideoDataModule(pl.LightningDataModule):
     """Posed RGB-D video from a folder of our schema.
 
     ``batch_size`` is the global one. ``target_views`` null means all; ``start_frames`` null means every start frame
-    that leaves room for the clip; ``num_trajectories`` null means the whole training split. ``num_steps_schedule``
-    maps fractions of the training to rollout lengths, or to lists of which every update draws one, and overrides
+    that leaves room for the clip; ``num_trajectories`` null means the whole training split. ``num_steps_schedule`` maps
+    fractions of the training to rollout lengths, or to lists of which every update draws one, and overrides
     ``num_steps`` in training (null: no schedule); fractions are of ``trainer.max_steps``, or of the time where
     ``training_progress`` is set (``callbacks.time_budget``). ``moving_ray_fraction`` of the rays goes to pixels that
-    differ from the per-camera training median by more than the thresholds (largest colour channel, in [0, 1]; depth, in metres), or lie within
-    ``moving_ray_margin`` pixels of one that does. With ``cache`` decoded frames stay in memory (in each loader worker;
-    with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
+    differ from the per-camera training median by more than the thresholds (largest colour channel, in [0, 1]; depth, in
+    metres), or lie within ``moving_ray_margin`` pixels of one that does. With ``cache`` decoded frames stay in memory
+    (in each loader worker; with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
     the input views' images of the frames to predict. ``sensor`` names a simulated sensor (``conf/sensor``) whose errors
     the training clips get, ``sensor_percent`` its noise at each trajectory's median depth; validation clips stay as
     they are.

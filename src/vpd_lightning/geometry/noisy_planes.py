@@ -106,8 +106,8 @@ def off_wide_planes(
     ``min_width`` of the diagonal of all that is seen. For each plane, view and distance its bias and noise are found
     anew: at grazing angles a sensor errs by more than it scatters. How many standard deviations a pixel lies off its
     nearest plane, and the labels of its neighbours (mean field of a Potts model), decide. ``rays`` are one unit along
-    the optical axis, in the world; ``noise`` is a share of depth (``relative_noise``), and so is ``pixel_sizes``, what a
-    pixel covers.
+    the optical axis, in the world; ``noise`` is a share of depth (``relative_noise``), and so is ``pixel_sizes``,
+    what a pixel covers.
     """
     views = _Views(depth.astype(np.float64), rays.astype(np.float64), centers.astype(np.float64), valid)
     if valid.sum() < _MIN_IN_BIN:
