@@ -1,22 +1,38 @@
-"""The folder of a data set in the making: never mixed with something else, resumable, used by one process at a time."""
+"""The folder of a data set in the making: never mixed with something else, resumable, never written twice at once.
+
+Processes that make different shards of it may share it; whichever finds all files there finishes the set.
+"""
 
 import json
 import os
 import platform
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from data_gen.settings import differences, settings_hash
-from vpd_lightning.data.manifest import FILE_NAME, SPLITS, UNFINISHED_NAME, Manifest, load_manifest, write_manifest
+from data_gen.shards import WHOLE, Shard
+from vpd_lightning.data.manifest import (
+    FILE_NAME,
+    SPLITS,
+    UNFINISHED_NAME,
+    Manifest,
+    file_sha256,
+    load_manifest,
+    write_manifest,
+)
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.errors import DataError
 from vpd_lightning.files import PARTIAL_SUFFIX, AtomicPath
 
 _DISK_RESERVE = 64 * 2**20
+
+
+class BusyFolderError(DataError):
+    """Another process writes the folder, or has just finished it."""
 
 
 class DatasetFolder:
@@ -73,26 +89,46 @@ class DatasetFolder:
         return {path for path in paths if self._is_ours(path)}
 
     @contextmanager
-    def claim(self) -> Iterator[None]:
-        """Make the folder, keep other processes out of it, and note what it is to become."""
+    def claim(self, shard: Shard = WHOLE) -> Iterator[None]:
+        """Make the folder, keep other processes out of it, and note what it is to become.
+
+        Processes with different shards of it may hold it together.
+
+        Raises:
+            DataError: another process has it, or it cannot be written.
+        """
         try:
             for split in SPLITS:
                 (self.folder / split).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DataError(f"{self.folder} cannot be written: {error.strerror}. Choose another out=FOLDER.") from error
-        handle = os.open(self.folder, os.O_RDONLY)
+        handles = [os.open(self.folder, os.O_RDONLY)]
         try:
-            self._lock(handle)
+            if shard.is_whole:
+                self._lock(handles[0], "LOCK_EX")
+            else:
+                self._lock(handles[0], "LOCK_SH")
+                own = self.folder / f".shard-{shard.number}-of-{shard.count}.lock"
+                handles.append(os.open(own, os.O_RDWR | os.O_CREAT, 0o644))
+                self._lock(handles[1], "LOCK_EX")
             if (self.folder / FILE_NAME).exists():
-                raise DataError(f"Another vpd-data has just finished {self.folder}. Run the command again to see it.")
-            for folder in (self.folder, *(self.folder / split for split in SPLITS)):
-                for left_over in folder.glob(f".*{PARTIAL_SUFFIX}"):  # of a killed process
-                    left_over.unlink(missing_ok=True)
+                raise BusyFolderError(
+                    f"Another vpd-data has just finished {self.folder}. Run the command again to see it."
+                )
+            if shard.is_whole:
+                self._remove_left_overs()
             with AtomicPath(self.folder / UNFINISHED_NAME) as partial:
                 partial.write_text(json.dumps(self.identity, indent=1) + "\n")
             yield
         finally:
-            os.close(handle)
+            for handle in handles:
+                os.close(handle)
+
+    def _remove_left_overs(self) -> None:
+        """Remove what killed processes left; only where no other process writes."""
+        for folder in (self.folder, *(self.folder / split for split in SPLITS)):
+            for left_over in [*folder.glob(f".*{PARTIAL_SUFFIX}"), *folder.glob(".shard-*.lock")]:
+                left_over.unlink(missing_ok=True)
 
     def finish(
         self,
@@ -123,6 +159,28 @@ class DatasetFolder:
             )
         )
         (self.folder / UNFINISHED_NAME).unlink(missing_ok=True)
+
+    def finish_shard(self, shard: Shard, paths: Sequence[Path], finish: Callable[[Mapping[Path, str]], None]) -> None:
+        """After a shard is made: finish the set where all its files are there, else say what is still missing.
+
+        Args:
+            shard: what was made, no longer claimed.
+            paths: all files of the set.
+            finish: writes the manifest; gets the SHA-256 of all files.
+        """
+        missing = len(paths) - len(self.done(paths))
+        if not missing:
+            try:
+                with self.claim():
+                    finish({path: file_sha256(path) for path in paths})
+            except BusyFolderError:
+                print(f"shard {shard} of {self.folder} is made; another process finishes the set.")
+            return
+        print(
+            f"shard {shard} of {self.folder} is made; {missing} files of the others are missing.\n"
+            "The last one finishes the set. Without a common disk: copy all files (.unfinished.json, too) into one\n"
+            "folder, and run the command once more without shard=."
+        )
 
     def require_space(self, num_bytes: int, num_files: int, smaller: str) -> None:
         """Refuse to begin what would not fit on the disk; ``smaller`` says how to ask for less."""
@@ -161,15 +219,15 @@ class DatasetFolder:
                 f"Choose another out=FOLDER, or delete that folder first (rm -r {self.folder})."
             )
 
-    def _lock(self, handle: int) -> None:
+    def _lock(self, handle: int, kind: str) -> None:
         try:
             import fcntl
         except ImportError:  # no such locks on this system
             return
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, getattr(fcntl, kind) | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise DataError(
+            raise BusyFolderError(
                 f"Another vpd-data is writing {self.folder}. Wait for it, or choose another out=FOLDER."
             ) from error
         except OSError:  # a file system without locks

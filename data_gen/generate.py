@@ -15,6 +15,7 @@ from data_gen.dataset_folder import DatasetFolder
 from data_gen.pool import num_cores, run_jobs
 from data_gen.progress import Progress
 from data_gen.settings import load_preset, load_settings
+from data_gen.shards import parse_shard
 from data_gen.simulated_sensor import rendered_settings
 from data_gen.stage_clock import STAGES
 from vpd_lightning.data.manifest import file_sha256
@@ -69,6 +70,7 @@ def generate(
     workers: int | None = None,
     overrides: Mapping[str, Any] | None = None,
     sensor: str = NO_SENSOR,
+    shard: str | None = None,
 ) -> Path:
     """Generate a data set and return its folder; complete files of an interrupted run are kept.
 
@@ -81,6 +83,7 @@ def generate(
         workers: processes; ``None`` takes all cores this process may use. It never changes the data.
         overrides: settings by (dotted) name, for example ``{"splits.train": 8}``; of the sensor: ``sensor.NAME``.
         sensor: file in ``conf/sensor``: what the cameras get wrong.
+        shard: ``i/n`` makes the i-th of n parts, on one of several machines; whichever ends last finishes the set.
 
     Raises:
         ConfigError: unknown names or values out of range.
@@ -94,43 +97,51 @@ def generate(
         raise ConfigError(f"workers is {workers}; at least 1 is needed.")
     if not 0 <= seed < 2**63:
         raise ConfigError(f"seed is {seed}; allowed: 0 to 2^63 - 1.")
+    part = parse_shard(shard)
     plan = make_plan(scene, preset, Path(out).expanduser().absolute(), seed, changes, sensor)
     folder, files = plan.folder, plan.files()
     if folder.is_complete():
         print(f"{plan.out} is complete already.")
         return plan.out
-    done = folder.done([path for paths in files.values() for path in paths])
-    missing = {
-        (split, index): path for split, paths in files.items() for index, path in enumerate(paths) if path not in done
-    }
+    wanted = part.of({(split, index): path for split, paths in files.items() for index, path in enumerate(paths)})
+    everything = [path for paths in files.values() for path in paths]
+    done = folder.done(everything) & set(wanted.values())
+    missing = {key: path for key, path in wanted.items() if path not in done}
     folder.require_space(_num_bytes(plan, len(missing)), len(missing), "ask for fewer (splits.train=N)")
     backend = _choose_backend(plan.settings.renderer) if missing else plan.settings.renderer
-    with folder.claim():
-        _fill(plan, folder, files, done, missing, backend, workers)
+
+    def finish(hashes: Mapping[Path, str]) -> None:
+        generator = f"vpd-data generate, renderer {backend}"
+        folder.finish(files, hashes, generator=generator, packages=_PACKAGES, preset=plan.preset, license=LICENSE)
+        size = sum(path.stat().st_size for path in hashes)
+        print(f"{plan.out}: {len(hashes)} trajectories, {size / 2**20:.1f} MiB, renderer {backend}")
+
+    with folder.claim(part):
+        made, speed = _fill(plan, folder, done, missing, backend, workers)
+        if part.is_whole:
+            finish({path: file.sha256 for path, file in made.items()} | {path: file_sha256(path) for path in done})
+    if not part.is_whole:
+        folder.finish_shard(part, everything, finish)
+    if speed:
+        print(speed)
     return plan.out
 
 
 def _fill(
     plan: Plan,
     folder: DatasetFolder,
-    files: dict[str, list[Path]],
     done: set[Path],
     missing: Mapping[tuple[str, int], Path],
     backend: str,
     workers: int | None,
-) -> None:
+) -> tuple[dict[Path, worker.MadeFile], str]:
+    """Make the missing files; return them, and how fast it went."""
     num_workers = min(workers or num_cores(), max(len(missing), 1))
     with Progress(f"{plan.scene} {plan.preset}", len(done) + len(missing), len(done)) as progress:
         started = time.monotonic()
         made = _make(plan, missing, backend, num_workers, folder.scene_hash, progress.advance)
         elapsed = time.monotonic() - started
-    hashes = {path: file.sha256 for path, file in made.items()} | {path: file_sha256(path) for path in done}
-    generator = f"vpd-data generate, renderer {backend}"
-    folder.finish(files, hashes, generator=generator, packages=_PACKAGES, preset=plan.preset, license=LICENSE)
-    size = sum(path.stat().st_size for path in hashes)
-    print(f"{plan.out}: {len(hashes)} trajectories, {size / 2**20:.1f} MiB, renderer {backend}")
-    if made:
-        print(_speed(plan, list(made.values()), elapsed, num_workers))
+    return made, _speed(plan, list(made.values()), elapsed, num_workers) if made else ""
 
 
 def _speed(plan: Plan, made: Sequence[worker.MadeFile], elapsed: float, num_workers: int) -> str:

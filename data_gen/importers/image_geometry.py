@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from data_gen.importers.images import pixel_centers, sample_depth
+from data_gen.importers.depth_cleanup import smoothed, without_flying_pixels
+from data_gen.importers.images import MEAN_FROM, mean_depth, pixel_centers, sample_depth
 from data_gen.importers.lens import distort
 from data_gen.importers.recording import Recording
 from data_gen.importers.settings import ImportSettings
 from vpd_lightning.errors import ConfigError
+from vpd_lightning.geometry.noisy_planes import relative_noise
 
 Array = NDArray[np.float64]
 
@@ -21,7 +23,8 @@ class ImageGeometry:
 
     Undistortion keeps each view's intrinsics; colour is interpolated, depth takes the nearest pixel, and what the lens
     did not see becomes black with depth 0. Then ``crop`` is cut out and scaled to ``height`` x ``width``: colour by
-    area (by interpolation where it grows), depth by the nearest pixel, because an average over an edge lies in the air.
+    area (by interpolation where it grows), depth by the mean over the pixels that show the same surface, because an
+    average over an edge lies in the air. Depth is cleaned before, as ``flying_pixels`` and ``smooth`` say.
 
     Raises:
         ConfigError: at construction, when the crop leaves the image or the pixels would no longer be square.
@@ -38,6 +41,7 @@ class ImageGeometry:
         self.left, self.top, self.crop_width, self.crop_height = left, top, width, height
         self.height = settings.height or (_proportional(settings.width, height, width) if settings.width else height)
         self.width = settings.width or (_proportional(settings.height, width, height) if settings.height else width)
+        self._flying_jump, self._smoothing_radius = settings.flying_pixels, settings.smooth
         self._maps: dict[int, tuple[bytes, tuple[Array, Array]]] = {}
 
     def intrinsics(self) -> Array:
@@ -63,18 +67,32 @@ class ImageGeometry:
         return cv2.resize(image, (self.width, self.height), interpolation=cv2.INTER_LINEAR if grows else cv2.INTER_AREA)
 
     def depth(self, frame: int, view: int) -> NDArray[np.float32]:
-        """Read and convert one depth image (height, width); nothing is averaged over edges."""
+        """Read, clean and convert one depth image (height, width); nothing is averaged over edges."""
         image = self._checked("depth", frame, view, self.recording.read_depth(frame, view), np.float32, 1)
         image = np.where(np.isfinite(image) & (image > 0), image, np.float32(0))
-        rows, columns = np.meshgrid(
-            self.top + pixel_centers(self.height, self.crop_height),
-            self.left + pixel_centers(self.width, self.crop_width),
-            indexing="ij",
-        )
+        if self._flying_jump is not None:
+            focal_length = float(self.recording.intrinsics_at(frame)[view, 0, 0])
+            image = without_flying_pixels(image, focal_length, self._flying_jump)
+        if self._smoothing_radius is not None:
+            image = smoothed(image, self._smoothing_radius)
         maps = self._undistortion(frame, view)
-        if maps is not None:
-            columns, rows = (map_coordinates(values, [rows, columns], order=1, mode="nearest") for values in maps)
-        return sample_depth(image, rows, columns)
+
+        def sample(down: float, right: float) -> NDArray[np.float32]:
+            """Return depth at the centres of the written pixels, shifted by so much of their sides."""
+            rows, columns = np.meshgrid(
+                self.top + pixel_centers(self.height, self.crop_height) + down * self.crop_height / self.height,
+                self.left + pixel_centers(self.width, self.crop_width) + right * self.crop_width / self.width,
+                indexing="ij",
+            )
+            if maps is not None:
+                columns, rows = (map_coordinates(values, [rows, columns], order=1, mode="nearest") for values in maps)
+            return sample_depth(image, rows, columns)
+
+        rows_each, columns_each = self.crop_height / self.height, self.crop_width / self.width
+        if max(rows_each, columns_each) < MEAN_FROM:
+            return sample(0.0, 0.0)
+        noise = float(relative_noise(image[None].astype(np.float64), image[None] > 0)[0])
+        return mean_depth(sample, rows_each, columns_each, noise)
 
     def _undistortion(self, frame: int, view: int) -> tuple[Array, Array] | None:
         """Return where each undistorted pixel lies in the read image (column, row; pixel centres at integers)."""

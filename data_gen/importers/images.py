@@ -1,6 +1,8 @@
 """Reading colour and depth images of recordings, with their sizes checked before and after decoding."""
 
+import math
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,9 @@ from vpd_lightning.errors import DataError
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".png", ".npy", ".tiff", ".tif")
 _ONE_SURFACE = 1.05  # largest over smallest depth of four neighbours that belong to one surface
+MEAN_FROM = 1.5  # pixels of the source under one of the result, from which on depth is averaged
+_NOISE_OF_ONE_SURFACE = 3.0  # standard deviations by which measurements of one surface may differ
+_ROUNDING = 1e-5  # share of depth; float32 of a plane
 _MAX_FILE_BYTES = 512 * 2**20
 _MAX_PIXELS = 2**27
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # the markers whose segment holds the image's size
@@ -110,6 +115,57 @@ def sample_depth(
     inverse = (shares / np.where(corners > 0, corners, 1.0)).sum(axis=0)
     sampled = np.where(is_smooth, 1.0 / np.where(is_smooth, inverse, 1.0), nearest)
     return np.where(is_seen, sampled, 0.0).astype(np.float32)
+
+
+def mean_depth(
+    sample: Callable[[float, float], NDArray[np.float32]], rows_each: float, columns_each: float, noise: float
+) -> NDArray[np.float32]:
+    """Return the depth of pixels of which each covers several of the source's: the mean inverse depth of one surface.
+
+    It has less noise than the middle. Samples count in pairs on opposite sides of the middle, where both show the
+    middle's surface and their mean is its depth but for noise: planes and creases stay where they are. A middle without
+    measurement has one where most of the pixel has: their median.
+
+    Args:
+        sample: depth (height, width) at places shifted down and right by shares of a pixel's sides; 0: not measured.
+        rows_each: how many rows of the source a pixel covers.
+        columns_each: how many columns.
+        noise: standard deviation of a sample, as a share of depth.
+    """
+    middle = sample(0.0, 0.0)
+    shifts = [
+        (down, right)
+        for down in _sub_places(rows_each)
+        for right in _sub_places(columns_each)
+        if (down, right) > (0.0, 0.0)
+    ]
+    if not shifts:
+        return middle
+    pairs = [(sample(down, right), sample(-down, -right)) for down, right in shifts]
+    every = np.array([one for pair in pairs for one in pair])
+    is_seen = every > 0
+    is_mostly_seen = is_seen.sum(axis=0) > len(every) / 2
+    typical = np.nanmedian(np.where(is_seen | ~is_mostly_seen, every, np.nan), axis=0)
+    middle = np.where((middle <= 0) & is_mostly_seen, typical, middle)
+    most = _NOISE_OF_ONE_SURFACE * noise * math.sqrt(1.5) + _ROUNDING  # of the mean of two, less the middle
+    total, count = np.where(middle > 0, 1 / np.where(middle > 0, middle, 1.0), 0.0), np.ones(middle.shape)
+    for one, other in pairs:
+        nearest, farthest = np.minimum(one, other), np.maximum(one, other)
+        is_same = (nearest * _ONE_SURFACE >= middle) & (farthest <= middle * _ONE_SURFACE) & (nearest > 0)
+        both = 1 / np.where(is_same, one, 1.0) + 1 / np.where(is_same, other, 1.0)
+        is_same &= np.abs(middle * both / 2 - 1) <= most
+        total += np.where(is_same, both, 0.0)
+        count += 2 * is_same
+    return np.where(middle > 0, count / np.where(middle > 0, total, 1.0), 0.0).astype(np.float32)
+
+
+def _sub_places(covered: float) -> list[float]:
+    """Return where samples lie in a pixel that covers so many of the source's, as shares of its side, 0 in the middle.
+
+    As many as it covers, so that each of the source's pixels counts about once; one where it covers less than two.
+    """
+    count = max(1, round(covered))
+    return [(place + 0.5) / count - 0.5 for place in range(count)]
 
 
 def _fitted(name: str, depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 
 from data_gen.importers.clips import Clip, plan_clips
+from data_gen.importers.depth_cleanup import HoleFiller
 from data_gen.importers.formats import open_format
 from data_gen.importers.image_geometry import ImageGeometry
+from data_gen.importers.recording import Recording
 from data_gen.importers.scene_bounds import SceneBounds, sample_points, scene_bounds
 from data_gen.importers.settings import ImportSettings
 from data_gen.importers.world_frame import WorldFrame
 from vpd_lightning.data.schema import Trajectory
-from vpd_lightning.errors import DataError
+from vpd_lightning.errors import ConfigError, DataError
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ def make_plan(path: Path, settings: ImportSettings, found: tuple[WorldFrame, Sce
     kept = {clip.recording.name: clip.recording for clip in clips}
     geometries = {name: ImageGeometry(recording, settings) for name, recording in kept.items()}
     _require_one_shape(geometries)
+    _require_fixed_cameras_to_fill_holes(kept, settings)
     if found is not None:
         return ImportPlan(path, name, settings, clips, geometries, *found, remarks)
     frame = WorldFrame(settings.up, settings.scale or 1.0)
@@ -67,11 +70,13 @@ def clip_trajectory(
     recording, geometry, settings = clip.recording, plan.geometries[clip.recording.name], plan.settings
     shape = (len(clip.frames), recording.num_views, geometry.height, geometry.width)
     rgb, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
+    fillers = [HoleFiller(settings.fill_holes or 0) for _ in range(recording.num_views)]
     for time, frame in enumerate(clip.frames):
         check_stop()
         for view in range(recording.num_views):
             rgb[time, view] = geometry.rgb(frame, view)
-            depth[time, view] = plan.frame.depth(geometry.depth(frame, view))
+            measured = plan.frame.depth(geometry.depth(frame, view))
+            depth[time, view] = fillers[view](measured) if settings.fill_holes else measured
     intrinsics, poses = geometry.intrinsics(), plan.frame.poses(recording.cam_to_world)
     kept = list(clip.frames)
     return Trajectory(
@@ -110,6 +115,15 @@ def _attributes(plan: ImportPlan, clip: Clip) -> dict[str, Any]:
         "source_size": np.array([recording.width, recording.height]),
         "source_undistorted": recording.distortion is not None,
     }
+
+
+def _require_fixed_cameras_to_fill_holes(recordings: Mapping[str, Recording], settings: ImportSettings) -> None:
+    moving = [name for name, one in recordings.items() if one.cam_to_world.ndim == 4 or one.intrinsics.ndim == 4]
+    if settings.fill_holes and moving:
+        raise ConfigError(
+            f"fill_holes={settings.fill_holes} needs cameras that stand still, but those of {moving[0]} move: what a "
+            "pixel showed before lies elsewhere.\nRemove fill_holes."
+        )
 
 
 def _require_one_shape(geometries: Mapping[str, ImageGeometry]) -> None:

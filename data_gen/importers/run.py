@@ -18,12 +18,13 @@ from data_gen.importers.import_plan import ImportPlan, clip_trajectory, make_pla
 from data_gen.importers.settings import load_import_settings
 from data_gen.pool import num_cores, run_jobs
 from data_gen.progress import Progress
+from data_gen.shards import parse_shard
 from data_gen.worker import environment
 from vpd_lightning.data.manifest import SPLITS, file_sha256
 from vpd_lightning.data.schema import write_trajectory
 from vpd_lightning.errors import ConfigError, DataError
 
-VERSION = 1  # of what the importers make from the same source and settings
+VERSION = 2  # of what the importers make from the same source and settings
 _PACKAGES = ("numpy", "h5py", "opencv-python-headless", "vpd-lightning")
 _MAPPED = ("ros", "lerobot", "tum")
 SCENE = "recordings"  # the manifest's scene
@@ -34,19 +35,22 @@ _ENCODER_STEP = 16  # sides that the paper's encoder can halve and double again
 _COMPRESSION_RATIO = 0.9  # of real pictures, at worst
 
 
-def import_recordings(source: str | Path, out: str | Path, overrides: Mapping[str, Any] | None = None) -> Path:
+def import_recordings(
+    source: str | Path, out: str | Path, overrides: Mapping[str, Any] | None = None, shard: str | None = None
+) -> Path:
     """Convert a source into a data set and return its folder; complete files of an interrupted import are kept.
 
     Args:
         source: folder or file; see ``formats.FORMATS``.
         out: folder to write; made if missing, and left alone if it holds something else.
         overrides: settings by (dotted) name; see ``settings.ImportSettings``.
+        shard: ``i/n`` makes the i-th of n parts, on one of several machines; whichever ends last finishes the set.
 
     Raises:
         ConfigError: unknown settings, or values out of range or of the wrong type.
         DataError: the source is broken or contradicts itself, ``out`` holds something else, or the disk is too small.
     """
-    settings = load_import_settings(overrides or {})
+    settings, part = load_import_settings(overrides or {}), parse_shard(shard)
     path = Path(source).expanduser().absolute()
     folder_path = Path(out).expanduser().absolute()
     if folder_path == path or path.is_dir() and folder_path in path.parents:
@@ -63,23 +67,30 @@ def import_recordings(source: str | Path, out: str | Path, overrides: Mapping[st
         print(f"{folder_path} is complete already.")
         return folder_path
     paths = [folder_path / clip.path for clip in plan.clips]
-    done = folder.done(paths)
-    missing = {path: clip for path, clip in zip(paths, plan.clips, strict=True) if path not in done}
+    wanted = part.of(dict(zip(paths, plan.clips, strict=True)))
+    done = folder.done(paths) & wanted.keys()
+    missing = {path: clip for path, clip in wanted.items() if path not in done}
     needed = sum(_num_bytes(plan, clip) for clip in missing.values())
     folder.require_space(needed, len(missing), "import less: height=, every=, max_recordings=")
     _workers_that_fit(plan)
     print(_description(plan))
-    with folder.claim():
-        with Progress(f"import {path.name}", len(paths), len(done)) as progress:
-            hashes = _make(plan, missing, folder.scene_hash, progress.advance)
-        hashes.update({path: file_sha256(path) for path in done})
+
+    def finish(hashes: Mapping[Path, str]) -> None:
         splits, generator = _splits(plan, folder_path), f"vpd-data import, format {plan.format}"
         folder.finish(splits, hashes, generator=generator, packages=_PACKAGES)
-    size = sum(path.stat().st_size for path in hashes)
-    print(
-        f"{folder_path}: {_counted(len(hashes), 'trajectory')}, {size / 2**20:.1f} MiB. "
-        f"Check it: vpd-data validate {folder_path}"
-    )
+        size = sum(path.stat().st_size for path in hashes)
+        print(
+            f"{folder_path}: {_counted(len(hashes), 'trajectory')}, {size / 2**20:.1f} MiB. "
+            f"Check it: vpd-data validate {folder_path}"
+        )
+
+    with folder.claim(part):
+        with Progress(f"import {path.name}", len(wanted), len(done)) as progress:
+            hashes = _make(plan, missing, folder.scene_hash, progress.advance)
+        if part.is_whole:
+            finish(hashes | {path: file_sha256(path) for path in done})
+    if not part.is_whole:
+        folder.finish_shard(part, paths, finish)
     return folder_path
 
 

@@ -47,6 +47,10 @@ class ImportSettings:
     crop: list[int] | None = None  # left, top, width, height in pixels, after undistortion
     height: int | None = None  # of the result, after the crop; one of the two gives the other
     width: int | None = None
+    # Depth as cameras measure it: what to clean before it is scaled
+    flying_pixels: float | None = None  # remove pixels in the air between surfaces: jumps of this share of depth (0.02)
+    smooth: float | None = None  # pixels of the source: radius of an edge-preserving filter
+    fill_holes: int | None = None  # frames back from which a fixed camera's holes may be filled
     # Conventions of the source, where it does not say or says it wrongly
     depth: str = AUTO  # z (along the optical axis) | distance (to the camera centre)
     depth_scale: float | None = None  # metres per unit of the depth images
@@ -74,11 +78,14 @@ class ImportSettings:
             setattr(self, name, aliases.get(getattr(self, name), getattr(self, name)))
         for name, choices in _CHOICES.items():
             _require(getattr(self, name) in choices, name, getattr(self, name), ", ".join(choices))
-        for name in ("max_recordings", "every", "workers"):
+        for name in ("max_recordings", "every", "workers", "fill_holes"):
             _require(_at_least(getattr(self, name), 1), name, getattr(self, name), "a whole number from 1 on")
         _require(_at_least(self.clip_frames, 3), "clip_frames", self.clip_frames, "3 or more (two seen, one predicted)")
         for name in ("frame_time", "depth_scale", "scale", "far"):
             _require(_is_positive(getattr(self, name)), name, getattr(self, name), "above 0")
+        for name, highest, unit in (("flying_pixels", 0.5, "share of depth"), ("smooth", 20, "pixels")):
+            value = getattr(self, name)
+            _require(value is None or 0 < value <= highest, name, value, f"above 0, to {highest:g} ({unit})")
         _require(0 <= self.max_time_difference <= 10, "max_time_difference", self.max_time_difference, "0 to 10 s")
         _require(self.near is None or 0 <= self.near < float("inf"), "near", self.near, "0 or more")
         if self.near is not None and self.far is not None:

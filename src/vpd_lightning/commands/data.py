@@ -10,7 +10,7 @@ from vpd_lightning.commands.data_help import HELP
 from vpd_lightning.commands.report_errors import run_command
 from vpd_lightning.errors import ConfigError, DataError
 
-_TEXT_SETTINGS = ("out", "scene", "preset", "renderer", "format", "mapping", "pixel_center", "up", "sensor")
+_TEXT_SETTINGS = ("out", "scene", "preset", "renderer", "format", "mapping", "pixel_center", "up", "sensor", "shard")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -78,6 +78,7 @@ def _generate(places: Sequence[str], settings: dict[str, Any]) -> int:
         renderer=settings.pop("renderer", None),
         workers=_whole_number("workers", settings.pop("workers")) if "workers" in settings else None,
         sensor=settings.pop("sensor", "none"),
+        shard=settings.pop("shard", None),
         overrides=settings,
     )
     return 0
@@ -88,7 +89,7 @@ def _import(places: Sequence[str], settings: dict[str, Any]) -> int:
         raise ConfigError("import takes one source and a folder to write:\n  vpd-data import SOURCE out=datasets/NAME")
     from data_gen.importers.run import import_recordings
 
-    import_recordings(places[0], settings.pop("out"), settings)
+    import_recordings(places[0], settings.pop("out"), settings, settings.pop("shard", None))
     return 0
 
 
