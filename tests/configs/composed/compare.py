@@ -1,9 +1,9 @@
 """Compare what ``dump.py`` wrote before a change with what it writes after it, but for a committed list of changes.
 
 ``python -m tests.configs.composed.compare BEFORE.json AFTER.json CHANGES.json [RESULT.json]``. The list of changes has
-five entries, each with its reasons: ``added`` and ``removed`` are keys (with all below them), ``changed`` keys with pairs
-of values before and after, ``gone_words`` words of a command line that are refused since, ``mended`` command lines whose
-configuration is meant to differ, with the keys.
+five entries, each with its reasons: ``added`` and ``removed`` are keys (with all below them), ``changed`` keys with
+pairs of values before and after, ``gone_words`` words of a command line that are refused since, ``mended`` command
+lines whose configuration is meant to differ, with the keys.
 """
 
 import json
