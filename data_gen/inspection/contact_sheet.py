@@ -12,6 +12,7 @@ _MAX_ROWS, _MAX_VIEWS, _MIN_SIDE = 8, 24, 96
 _MAX_TRAJECTORIES, _FRAMES_EACH = 16, 6
 _MAX_WIDTH = 4096  # pixels of the whole sheet
 _GAP = 2
+_MASK_COLOR = np.array([255.0, 40.0, 40.0])
 
 
 def view_sheet(path: Path) -> NDArray[np.uint8]:
@@ -33,6 +34,16 @@ def trajectory_sheet(paths: Sequence[Path]) -> NDArray[np.uint8]:
             rows.append(reader.rgb(times, [0])[:, 0])
     shape = rows[0].shape
     return _tiled(np.stack([row for row in rows if row.shape == shape]))  # sizes may differ; validate says so
+
+
+def mask_sheet(path: Path, times: Sequence[int], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return frames (down) by views (across) of one trajectory, with the pixels of a mask (same axes) in red."""
+    with TrajectoryReader(path) as reader:
+        views = np.arange(min(reader.num_views, _MAX_VIEWS))
+        rgb = reader.rgb(times, views)
+    grey = np.repeat(rgb.mean(axis=-1, keepdims=True), 3, axis=-1)
+    tinted = np.where(mask[:, : len(views), ..., None], 0.45 * rgb + 0.55 * _MASK_COLOR, 0.7 * grey)
+    return _tiled(tinted.astype(np.uint8))
 
 
 def color_depth(depth: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -1,11 +1,13 @@
 """What is in a data set: in words, as contact sheets, as a plan of the cameras, and as a point cloud."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_gen.inspection.camera_plot import draw_cameras
-from data_gen.inspection.contact_sheet import trajectory_sheet, view_sheet
+from data_gen.inspection.contact_sheet import mask_sheet, trajectory_sheet, view_sheet
 from data_gen.inspection.pictures import write_figure, write_png
 from data_gen.inspection.point_cloud import draw_points, merged_points
 from vpd_lightning.data.ground_truth import has_state
@@ -17,6 +19,16 @@ from vpd_lightning.media.ply import write_ply
 SHEET_NAME = "contact_sheet.png"
 TRAJECTORIES_NAME, CAMERAS_NAME = "trajectories.png", "cameras.png"
 POINTS_NAME, POINTS_PICTURE_NAME = "points.ply", "points.png"
+MASK_NAME = "may_move.png"
+
+
+def draw_mask(path: Path, out: Path | None, times: Sequence[int], mask: NDArray[np.bool_]) -> Path:
+    """Draw frames (down) by views (across) of a trajectory file, a mask in red; return the path of the PNG.
+
+    ``out`` is as in ``inspect_dataset``.
+    """
+    target = path.parent if out is None else out.parent if out.suffix.lower() == ".png" else out
+    return write_png(target / MASK_NAME, mask_sheet(path, times, mask))
 
 
 def inspect_dataset(path: str | Path, out: Path | None = None) -> list[Path]:
@@ -29,7 +41,7 @@ def inspect_dataset(path: str | Path, out: Path | None = None) -> list[Path]:
     path = Path(path)
     written = [draw_contact_sheet(path, out)]
     folder = written[0].parent
-    files = _files(path)
+    files = files_of(path)
     if path.is_dir():
         written.append(write_png(folder / TRAJECTORIES_NAME, trajectory_sheet(files)))
     with TrajectoryReader(files[0]) as reader:
@@ -52,7 +64,7 @@ def draw_contact_sheet(path: str | Path, out: Path | None = None) -> Path:
     target = out if out is not None else path.parent if path.is_file() else path
     if target.suffix.lower() != ".png":
         target = target / SHEET_NAME
-    return write_png(target, view_sheet(_files(path)[0]))
+    return write_png(target, view_sheet(files_of(path)[0]))
 
 
 def describe(path: str | Path) -> str:
@@ -69,7 +81,7 @@ def describe(path: str | Path) -> str:
             f"licence        {manifest.license}",
             f"data SHA-256   {manifest.digest}",
         ]
-        path = _files(path)[0]
+        path = files_of(path)[0]
     with TrajectoryReader(path) as reader:
         intrinsics, cam_to_world = reader.cameras([0])
         depth = reader.depth([0])
@@ -90,7 +102,8 @@ def describe(path: str | Path) -> str:
     return "\n".join(lines)
 
 
-def _files(path: Path) -> list[Path]:
+def files_of(path: Path) -> list[Path]:
+    """Return the trajectory files of a data set folder, or the one file that the path is."""
     if path.is_file():
         return [path]
     files = [file for members in load_manifest(path).splits.values() for file in members]

@@ -22,7 +22,8 @@ def test_generate_inspect_and_validate_work_together(tmp_path: Path, capsys: pyt
 
     printed = capsys.readouterr().out
     assert "2 trajectories" in printed and "is valid" in printed and "train 1, validation 0, test 1" in printed
-    assert (tmp_path / "sheet.png").stat().st_size > 1000
+    assert "depth noise    0.00 % of depth" in printed and "may move" in printed
+    assert (tmp_path / "sheet.png").stat().st_size > 1000 and (tmp_path / "may_move.png").stat().st_size > 1000
 
 
 def test_validate_lists_faults_and_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

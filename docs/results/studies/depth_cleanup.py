@@ -25,13 +25,13 @@ from vpd_lightning.data.sensors import Sensor, load_sensor
 from vpd_lightning.data.sensors.sensor import median_depth
 from vpd_lightning.files import AtomicPath
 
-SCENES = ("mujoco_block", "deformable_collision", "movi_a")
+SCENES = ("mujoco_block", "deformable_collision")
 SENSORS = ("structured_light", "active_stereo", "time_of_flight")
 FULL_SIZE = ("as measured", "flying_pixels=0.02", "smooth=2", "flying_pixels=0.02 smooth=2")
 SMALL_SIZE = ("height=96", "height=96 flying_pixels=0.02 smooth=2", "height=96 flying_pixels=0.02 smooth=4")
 MIDDLE = "height=96, depth of the middle"  # as imports were before
 IN_THE_AIR = 0.03
-FRAMES = (0, 8, 16)
+FRAMES = (0, 12)
 
 
 def measure(path: Path, sensor_name: str, frames: Sequence[int]) -> dict[str, dict[str, float]]:

@@ -24,9 +24,7 @@ from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.data.sensors import Sensor, load_sensor
 from vpd_lightning.data.sensors.sensor import median_depth
-from vpd_lightning.encoder.particles.unprojection import UnprojectingEncoder, _cropped
-from vpd_lightning.geometry.cameras import unproject
-from vpd_lightning.geometry.workspace import inside_workspace
+from vpd_lightning.encoder.particles.unprojection import UnprojectingEncoder
 from vpd_lightning.types import RGBDFrames
 
 SCENES = (
@@ -63,16 +61,12 @@ def measure_cell(
     """Return precision, recall, the counts behind them, and the seconds of one frame of all views."""
     hit = said = true = 0
     seconds = []
-    assert encoder.background is not None
     for path in load_manifest(folder).split("test"):
         frames, body = noisy_frames(path, times, sensor, percent)
-        points = unproject(frames.depth, frames.cameras).flatten(1, 3)
-        inside = inside_workspace(points, encoder.workspace_min, encoder.workspace_max)
-        candidates = inside & (frames.depth > 0).flatten(1)
         start = time.process_time()
-        found = encoder.background(_cropped(frames, candidates)) & candidates.view_as(frames.depth)
+        found, candidates = encoder.moving_pixels(frames)
         seconds.append((time.process_time() - start) / len(times))
-        body = body & candidates.view_as(frames.depth)
+        body = body & candidates
         hit, said, true = hit + int((found & body).sum()), said + int(found.sum()), true + int(body.sum())
     return {
         "precision": hit / max(said, 1), "recall": hit / max(true, 1), "found": said, "true": true,

@@ -96,11 +96,18 @@ def _import(places: Sequence[str], settings: dict[str, Any]) -> int:
 def _inspect(places: Sequence[str], settings: dict[str, Any]) -> int:
     path = _one_place("inspect", places)
     _only("inspect", settings, ("out",))
-    from data_gen.inspection.inspect import describe, inspect_dataset
+    from data_gen.inspection.inspect import describe, draw_mask, files_of, inspect_dataset
+    from vpd_lightning.runs.moving_pixels import find_moving_pixels
 
     print(describe(path))
-    for drawn in inspect_dataset(path, Path(settings["out"]) if settings.get("out") else None):
-        print(f"wrote          {drawn}")
+    out = Path(settings["out"]) if settings.get("out") else None
+    drawn = inspect_dataset(path, out)
+    first = files_of(path)[0]
+    found = find_moving_pixels(first)
+    print("\n".join(found.summary()))
+    drawn.append(draw_mask(first, out or drawn[0].parent, found.times, found.moving))
+    for picture in drawn:
+        print(f"wrote          {picture}")
     return 0
 
 

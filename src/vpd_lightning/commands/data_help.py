@@ -18,6 +18,7 @@ HELP = f"""vpd-data: make, bring in, look at and check data sets of posed RGB-D 
       renderer  auto (EGL, then OSMesa), egl, osmesa, blender (docs/blender.md), raycast (mujoco_block without GL)
       workers   processes; all cores by default; never changes the data
       sensor    none, structured_light, active_stereo, time_of_flight: what the cameras get wrong (docs/datasets.md)
+      shard     i/n: the i-th of n parts, on one of several machines; the last one to end finishes the set (also import)
       SETTING   any setting of the preset, for example splits.train=8 camera.num_views=4 block.side=0.2
 
   vpd-data import SOURCE out=FOLDER [format=auto] [SETTING=VALUE ...]
@@ -25,6 +26,7 @@ HELP = f"""vpd-data: make, bring in, look at and check data sets of posed RGB-D 
       format    plain (images, depth, cameras.json), transforms (nerfstudio, instant-ngp), kubric, movi (TFDS records),
                 tum (TUM RGB-D), ros (bags), lerobot; auto recognises them
       SETTING   every=2 clip_frames=48 height=128 width=128 crop=[0,0,480,480] frame_time=0.05
+                flying_pixels=0.02 smooth=2 fill_holes=10 (cleaning depth)
                 near=0.3 far=3 workspace_min=[-1,-1,0] workspace_max=[1,1,1] splits.test=0.2
                 depth=z|distance depth_scale=0.001 axes=opencv|opengl pixel_center=0.5|0.0 scale=... up=z mapping=FILE
 

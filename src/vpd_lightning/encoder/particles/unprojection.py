@@ -148,14 +148,29 @@ class UnprojectingEncoder(AbstractEncoder):
         return replace(particles, scenery=scenery_of(frames, everywhere, normals, still, far, occluders_of(particles)))
 
     @torch.no_grad()
+    def moving_pixels(
+        self, frames: RGBDFrames
+    ) -> tuple[Bool[Tensor, "batch view height width"], Bool[Tensor, "batch view height width"]]:
+        """Return which pixels may move, and which are measured and in the workspace (the first are among these).
+
+        Raises:
+            ValueError: the encoder has no background model.
+        """
+        if self.background is None:
+            raise ValueError("what may move is found by a background model; set encoder.background")
+        points = unproject(frames.depth, frames.cameras).flatten(1, 3)
+        measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
+        candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
+        moving = self.background(_cropped(frames, candidates)) & candidates.view_as(frames.depth)
+        return moving, candidates.view_as(frames.depth)
+
+    @torch.no_grad()
     def observe(self, frames: RGBDFrames, keys: RandomKeys, purpose: str) -> dict[str, Tensor]:
         """Return a quarter as many points that may move as there are particles; nothing without a background."""
         if self.background is None:
             return {}
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
-        measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
-        candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
-        dynamic_mask = candidates & self.background(_cropped(frames, candidates)).flatten(1)
+        dynamic_mask = self.moving_pixels(frames)[0].flatten(1)
         count = max(1, self.num_particles // 4)
         drawn = [
             workspace.choose(allowed, count, generator)
