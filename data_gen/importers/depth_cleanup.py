@@ -21,6 +21,9 @@ _DIAGONALS = ((1, 1), (1, -1))
 _NOISE_KEPT_APART = 3.0
 """Standard deviations by which two pixels must differ to be smoothed apart."""
 
+_NOISE_OF_A_JUMP = 4.0
+"""Standard deviations by which neighbours on one surface hardly ever differ."""
+
 _LEAST_NOISE = 1e-4
 """Share of depth below which noise is taken for rounding; keeps the filter from dividing by nothing."""
 
@@ -37,9 +40,11 @@ def without_flying_pixels(depth: Depth, focal_length: float, jump: float) -> Dep
     Args:
         depth: (height, width) metres.
         focal_length: in pixels; surfaces less steep than 80 degrees to the line of sight are kept.
-        jump: share of depth by which a pixel must differ from both opposite neighbours, to be removed.
+        jump: share of depth by which a pixel must differ from both opposite neighbours, to be removed; more where
+            that is within the noise that the image shows.
     """
-    step = max(jump, _STEEPEST / focal_length) * depth
+    noise = float(relative_noise(depth[None].astype(np.float64), depth[None] > 0)[0])
+    step = max(jump, _STEEPEST / focal_length, _NOISE_OF_A_JUMP * noise) * depth
     padded = np.pad(depth, 1)
     height, width = depth.shape
 

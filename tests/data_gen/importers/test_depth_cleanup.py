@@ -65,6 +65,12 @@ def test_of_perfect_depth_nothing_is_removed_up_to_a_steep_view() -> None:
     assert np.array_equal(without_flying_pixels(TRUE, FOCAL_LENGTH, 0.02), TRUE)
 
 
+def test_noise_is_not_taken_for_jumps() -> None:
+    noise = np.random.default_rng(0).standard_normal((HEIGHT, WIDTH)).astype(np.float32)
+    depth = np.float32(18.0) * (1 + np.float32(0.035) * noise)
+    assert (without_flying_pixels(depth, FOCAL_LENGTH, 0.02) > 0).mean() > 0.99
+
+
 def test_a_pixel_by_itself_goes_and_what_was_not_measured_stays_so() -> None:
     depth = np.full((7, 7), 2.0, np.float32)
     depth[3, 3], depth[0, 0] = 1.5, 0.0
