@@ -112,6 +112,9 @@ class HoleFiller:
         has_changed = is_measured & is_known & ~is_same
         around = np.ones((_SURROUNDINGS, _SURROUNDINGS), np.uint8)
         near_change = cv2.dilate(has_changed.astype(np.uint8), around).astype(bool)
+        # A hole is taken as a whole: in its middle nothing is measured that could have changed.
+        _, holes = cv2.connectedComponents((~is_measured).astype(np.uint8), connectivity=8)
+        near_change |= np.isin(holes, np.unique(holes[near_change & ~is_measured])) & ~is_measured
         age = self._age + 1
         is_filled = ~is_measured & self._is_steady & (age <= self.max_age) & ~near_change
         filled = np.where(is_filled, self._last, depth)

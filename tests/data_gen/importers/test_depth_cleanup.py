@@ -167,6 +167,17 @@ def test_a_hole_in_something_that_moves_stays_a_hole() -> None:
     assert fill(far_off)[0, 8] == 2
 
 
+def test_a_wide_hole_where_something_left_is_not_filled_with_it_not_even_in_its_middle() -> None:
+    fill = HoleFiller(10)
+    body = np.full((21, 21), 2.0, np.float32)
+    body[3:18, 3:18] = 1.0
+    fill(body), fill(body)
+    left = np.full((21, 21), 2.0, np.float32)
+    left[4:17, 4:17] = 0  # only a rim of what is behind the body is measured
+    assert (fill(left)[4:17, 4:17] == 0).all()
+    assert (fill(left)[4:17, 4:17] == 0).all()
+
+
 def test_holes_of_an_import_are_filled_from_earlier_frames_alone(tmp_path: Path) -> None:
     source = write_plain(tmp_path / "take", num_frames=6, num_views=1, depth="npy")
     stored = sorted((source / "view0" / "depth").glob("*.npy"))
