@@ -9,10 +9,8 @@ from pathlib import Path
 
 import cv2
 
-from data_gen.importers.import_plan import clip_trajectory, make_plan
-from data_gen.importers.scene_bounds import SceneBounds
+from data_gen.importers.import_plan import Found, clip_trajectory, make_plan
 from data_gen.importers.settings import ImportSettings
-from data_gen.importers.world_frame import WorldFrame
 from data_gen.stage_clock import StageClock
 from vpd_lightning.data.schema import Trajectory
 
@@ -23,7 +21,7 @@ class ImportJob:
 
     source: Path
     settings: ImportSettings
-    found: tuple[WorldFrame, SceneBounds]
+    found: Found
 
     @property
     def storage(self) -> ImportSettings:

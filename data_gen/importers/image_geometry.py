@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from data_gen.importers.depth_cleanup import smoothed, without_flying_pixels
+from data_gen.importers.depth_registration import DepthRegistration
 from data_gen.importers.images import MEAN_FROM, mean_depth, pixel_centers, sample_depth
 from data_gen.importers.lens import distort
 from data_gen.importers.recording import Recording
@@ -24,7 +25,8 @@ class ImageGeometry:
     Undistortion keeps each view's intrinsics; colour is interpolated, depth takes the nearest pixel, and what the lens
     did not see becomes black with depth 0. Then ``crop`` is cut out and scaled to ``height`` x ``width``: colour by
     area (by interpolation where it grows), depth by the mean over the pixels that show the same surface, because an
-    average over an edge lies in the air. Depth is cleaned before, as ``flying_pixels`` and ``smooth`` say.
+    average over an edge lies in the air. Depth is cleaned before, as ``flying_pixels`` and ``smooth`` say, and then
+    registered to the colour camera, where a sensor of its own took it.
 
     Raises:
         ConfigError: at construction, when the crop leaves the image or the pixels would no longer be square.
@@ -43,6 +45,7 @@ class ImageGeometry:
         self.width = settings.width or (_proportional(settings.height, width, height) if settings.height else width)
         self._flying_jump, self._smoothing_radius = settings.flying_pixels, settings.smooth
         self._maps: dict[int, tuple[bytes, tuple[Array, Array]]] = {}
+        self._registrations: dict[int, tuple[bytes, DepthRegistration]] = {}
 
     def intrinsics(self) -> Array:
         """Return the recording's intrinsics, (view, 3, 3) or (time, view, 3, 3), for the written images."""
@@ -70,12 +73,17 @@ class ImageGeometry:
         """Read, clean and convert one depth image (height, width); nothing is averaged over edges."""
         image = self._checked("depth", frame, view, self.recording.read_depth(frame, view), np.float32, 1)
         image = np.where(np.isfinite(image) & (image > 0), image, np.float32(0))
+        sensor = self.recording.depth_camera(view)
         if self._flying_jump is not None:
-            focal_length = float(self.recording.intrinsics_at(frame)[view, 0, 0])
-            image = without_flying_pixels(image, focal_length, self._flying_jump)
+            matrix = self.recording.intrinsics_at(frame)[view] if sensor is None else sensor.intrinsics
+            image = without_flying_pixels(image, float(matrix[0, 0]), self._flying_jump)
         if self._smoothing_radius is not None:
             image = smoothed(image, self._smoothing_radius)
-        maps = self._undistortion(frame, view)
+        maps = None
+        if sensor is None:
+            maps = self._undistortion(frame, view)
+        else:
+            image = self._registration(frame, view)(image)
 
         def sample(down: float, right: float) -> NDArray[np.float32]:
             """Return depth at the centres of the written pixels, shifted by so much of their sides."""
@@ -106,8 +114,19 @@ class ImageGeometry:
             self._maps[view] = cached = (key, maps)
         return cached[1]
 
+    def _registration(self, frame: int, view: int) -> DepthRegistration:
+        """Return what takes a view's depth to its colour image without distortion."""
+        sensor, matrix = self.recording.depth_camera(view), self.recording.intrinsics_at(frame)[view]
+        assert sensor is not None
+        cached = self._registrations.get(view)
+        if cached is None or cached[0] != matrix.tobytes():
+            made = DepthRegistration(sensor, matrix, self.recording.height, self.recording.width)
+            self._registrations[view] = cached = (matrix.tobytes(), made)
+        return cached[1]
+
     def _checked(self, name: str, frame: int, view: int, image: NDArray[Any], dtype: type, channels: int) -> Any:
-        shape = (self.recording.height, self.recording.width, 3)[: 3 if channels == 3 else 2]
+        taken_by = (self.recording.depth_camera(view) if name == "depth" else None) or self.recording
+        shape = (taken_by.height, taken_by.width, 3)[: 3 if channels == 3 else 2]
         if image.dtype != dtype or image.shape != shape:
             raise ValueError(f"{name}({frame}, {view}) is {image.dtype} {image.shape}; it must be {dtype} {shape}")
         return image

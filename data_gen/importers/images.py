@@ -34,6 +34,15 @@ def image_size(path: Path) -> tuple[int, int]:
     return size
 
 
+def depth_size(path: Path) -> tuple[int, int]:
+    """Return (height, width) of a depth image."""
+    values = _array(path) if path.suffix.lower() == ".npy" else _decoded(path, cv2.IMREAD_UNCHANGED)
+    size = values.shape[1:] if values.ndim == 3 and values.shape[0] == 1 else values.shape[:2]
+    if len(size) != 2:
+        raise DataError(f"{path} is {values.dtype} {values.shape}; depth must have one channel.")
+    return size[0], size[1]
+
+
 def read_color(path: Path, height: int, width: int) -> NDArray[np.uint8]:
     """Read (height, width, 3) sRGB; transparency is ignored, and so is a camera's note to turn the picture."""
     image = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

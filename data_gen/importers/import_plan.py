@@ -1,40 +1,62 @@
 """What an import will write: which clips, from which images, in which world; and each clip made into a trajectory."""
 
 import itertools
+import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_gen.importers.clips import Clip, plan_clips
 from data_gen.importers.depth_cleanup import HoleFiller
 from data_gen.importers.formats import open_format
 from data_gen.importers.image_geometry import ImageGeometry
+from data_gen.importers.pose_refinement import refine_poses
 from data_gen.importers.recording import Recording
 from data_gen.importers.scene_bounds import SceneBounds, sample_points, scene_bounds
 from data_gen.importers.settings import ImportSettings
 from data_gen.importers.world_frame import WorldFrame
-from vpd_lightning.data.schema import Trajectory
+from vpd_lightning.data.schema import VIEW_NAMES, Trajectory
 from vpd_lightning.errors import ConfigError, DataError
 
 
 @dataclass(frozen=True)
+class Found:
+    """What looking at images has shown: the world, its bounds, and refined poses (view, 4, 4) by recording."""
+
+    frame: WorldFrame
+    bounds: SceneBounds
+    poses: Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
 class ImportPlan:
-    """What is to be written, and how the recordings become it."""
+    """What is to be written, and how the recordings become it; ``sources`` are as they were given, by name."""
 
     source: Path
     format: str
     settings: ImportSettings
     clips: list[Clip]
-    geometries: dict[str, ImageGeometry]
-    frame: WorldFrame
-    bounds: SceneBounds
+    sources: Mapping[str, Recording]
+    geometries: Mapping[str, ImageGeometry]
+    found: Found
     remarks: list[str]
 
+    @property
+    def frame(self) -> WorldFrame:
+        """From the source's world to the data set's."""
+        return self.found.frame
 
-def make_plan(path: Path, settings: ImportSettings, found: tuple[WorldFrame, SceneBounds] | None = None) -> ImportPlan:
+    @property
+    def bounds(self) -> SceneBounds:
+        """Workspace, near and far."""
+        return self.found.bounds
+
+
+def make_plan(path: Path, settings: ImportSettings, found: Found | None = None) -> ImportPlan:
     """List the recordings and decide everything that does not need all their images.
 
     ``found`` is what an earlier call found out by looking at images; with it none is read.
@@ -52,22 +74,47 @@ def make_plan(path: Path, settings: ImportSettings, found: tuple[WorldFrame, Sce
     geometries = {name: ImageGeometry(recording, settings) for name, recording in kept.items()}
     _require_one_shape(geometries)
     _require_fixed_cameras_to_fill_holes(kept, settings)
-    if found is not None:
-        return ImportPlan(path, name, settings, clips, geometries, *found, remarks)
+    if found is None:
+        found, lines = _look(geometries, settings)
+        remarks += lines
+    if found.poses:
+        geometries = {
+            name: ImageGeometry(replace(recording, cam_to_world=found.poses[name]), settings)
+            for name, recording in kept.items()
+        }
+    return ImportPlan(path, name, settings, clips, kept, geometries, found, remarks)
+
+
+def _look(geometries: Mapping[str, ImageGeometry], settings: ImportSettings) -> tuple[Found, list[str]]:
+    """Look at images to find out what the source does not say."""
+    poses: Mapping[str, NDArray[np.float64]] = {}
+    remarks: list[str] = []
+    if settings.refine_poses:
+        refined = refine_poses(geometries, settings.every)
+        poses, remarks = refined.poses, list(refined.remarks)
+        geometries = {
+            name: ImageGeometry(replace(geometry.recording, cam_to_world=poses[name]), settings)
+            for name, geometry in geometries.items()
+        }
     frame = WorldFrame(settings.up, settings.scale or 1.0)
     points = sample_points(list(geometries.values()), frame, settings.every)
     if settings.recenter:
         shift = -np.round(np.median(points.positions, axis=0), 6)
         frame = WorldFrame(settings.up, settings.scale or 1.0, shift)
     bounds = scene_bounds(points, frame.shift, settings)
-    return ImportPlan(path, name, settings, clips, geometries, frame, bounds, remarks)
+    if bounds.ground is not None:
+        remarks.append(
+            f"the ground at z = {bounds.ground:.2f} m counts for the workspace only around what stands on it"
+        )
+    return Found(frame, bounds, poses), remarks
 
 
 def clip_trajectory(
     plan: ImportPlan, clip: Clip, scene_hash: str, check_stop: Callable[[], None] = lambda: None
 ) -> Trajectory:
     """Read and convert all images of one clip; ``check_stop`` is called before each frame and may raise."""
-    recording, geometry, settings = clip.recording, plan.geometries[clip.recording.name], plan.settings
+    geometry, settings = plan.geometries[clip.recording.name], plan.settings
+    recording = geometry.recording
     shape = (len(clip.frames), recording.num_views, geometry.height, geometry.width)
     rgb, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
     fillers = [HoleFiller(settings.fill_holes or 0) for _ in range(recording.num_views)]
@@ -100,7 +147,13 @@ def clip_trajectory(
 def _attributes(plan: ImportPlan, clip: Clip) -> dict[str, Any]:
     """Return what a reader may want to know of the source; ``recording`` keeps clips of one recording together."""
     recording, settings = clip.recording, plan.settings
+    poses = plan.found.poses.get(recording.name)
     found = {f"source_{key}": value for key, value in recording.source.items() if key not in ("format", "depth_type")}
+    if poses is not None:
+        moved = np.linalg.norm(poses[:, :3, 3] - recording.cam_to_world[:, :3, 3], axis=1)
+        found["source_poses_moved"] = moved * plan.frame.scale  # metres, of each view
+    if recording.view_names:
+        found[VIEW_NAMES] = json.dumps(list(recording.view_names))
     return {
         **found,
         "recording": recording.name,

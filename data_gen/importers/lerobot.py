@@ -131,8 +131,8 @@ def _recording(
             "axes": _said(axes),
             "depth_type": _said(types),
             "pixel_center": _said([f"{center:.1f}" for center in centers]),
-            "views": " ".join(view.name for view in views),
         },
+        view_names=[view.name for view in views],
         distortion=distortion,
         split=episode.split,
     )

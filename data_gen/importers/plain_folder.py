@@ -38,7 +38,15 @@ taken at the same moment. ``cameras.json``::
 a wrong one spoils a data set without a word; ``vpd-data validate`` checks against the data whether they fit.
 
 Depth is in the colour camera's frame. A depth image of another size but the same field of view (phones) is fitted
-to colour.
+to colour. Where a depth sensor beside the colour camera took it and nothing aligned it, the view describes that sensor,
+and depth is registered to colour::
+
+          "depth_camera": {
+            "fx": 380.0, "fy": 380.0, "cx": 318.0, "cy": 241.0,                  pixels of the depth images; or "K"
+            "distortion": [k1, k2, p1, p2, k3],                                  optional
+            "depth_to_color": [[...], [...], [...], [0, 0, 0, 1]]                4x4, metres: points of the sensor's
+          }                                                                      frame in the colour camera's; of both
+                                                                                 x right, y down, z forward
 """
 
 import re
@@ -51,19 +59,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.importers.conventions import (
-    camera_matrix,
-    checked_intrinsics,
-    checked_pose,
     distance_to_z,
-    invert_pose,
     join_views,
     opengl_to_opencv,
     shift_principal_point,
 )
-from data_gen.importers.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, image_size, read_color, read_depth
+from data_gen.importers.depth_registration import DepthCamera
+from data_gen.importers.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, depth_size, image_size, read_color, read_depth
+from data_gen.importers.plain_cameras import (
+    PIXEL_CENTERS,
+    depth_camera,
+    view_distortion,
+    view_intrinsics,
+    view_poses,
+)
 from data_gen.importers.recording import Recording
 from data_gen.importers.settings import AUTO, ImportSettings
-from data_gen.importers.source_files import choice, inside, number, positive, read_json
+from data_gen.importers.source_files import choice, inside, positive, read_json
 from vpd_lightning.data.manifest import SPLITS
 from vpd_lightning.errors import DataError
 
@@ -71,7 +83,6 @@ FORMAT = "plain"
 CAMERAS_FILE = "cameras.json"
 _MAX_VIEWS = 256
 _AXES = {"opencv": "x right, y down, z forward", "opengl": "x right, y up, z back"}
-_PIXEL_CENTERS = {0.0: "OpenCV, ROS, RealSense", 0.5: "COLMAP, nerfstudio, most renderers"}
 _DEPTH_TYPES = {"z": "along the optical axis", "distance": "to the camera centre"}
 
 
@@ -84,6 +95,7 @@ class _View:
     intrinsics: NDArray[np.float64]  # (3, 3) or (time, 3, 3)
     cam_to_world: NDArray[np.float64]  # (4, 4) or (time, 4, 4)
     distortion: NDArray[np.float64] | None
+    depth_camera: DepthCamera | None
     depth_type: str
     depth_unit: float | None
     conventions: dict[str, str]
@@ -130,9 +142,13 @@ def _recording(folder: Path, settings: ImportSettings) -> Recording:
 
     def depth_of(frame: int, view: int) -> NDArray[np.float32]:
         chosen = views[view]
-        depth = read_depth(chosen.depth[frame], height, width, chosen.depth_unit, settings.depth_scale or 1.0)
+        sensor = chosen.depth_camera
+        size = (height, width) if sensor is None else (sensor.height, sensor.width)
+        depth = read_depth(chosen.depth[frame], *size, chosen.depth_unit, settings.depth_scale or 1.0)
         if chosen.depth_type == "z":
             return depth
+        if sensor is not None:
+            return distance_to_z(depth, sensor.intrinsics, sensor.distortion)
         matrix = chosen.intrinsics if chosen.intrinsics.ndim == 2 else chosen.intrinsics[frame]
         return distance_to_z(depth, matrix, chosen.distortion)
 
@@ -149,6 +165,8 @@ def _recording(folder: Path, settings: ImportSettings) -> Recording:
         read_depth=depth_of,
         source={"format": FORMAT, **_common([view.conventions for view in views])},
         distortion=_distortions(views),
+        view_names=[entry["name"] for entry in listed],
+        depth_cameras=[view.depth_camera for view in views],
         split=choice(content, "split", str(file), dict.fromkeys(SPLITS, "")) if "split" in content else None,
     )
 
@@ -171,12 +189,15 @@ def _view(
     if settings.pixel_center != AUTO:
         pixel_center = float(settings.pixel_center)
     else:
-        pixel_center = float(choice(given, "pixel_center", where, _PIXEL_CENTERS))
+        pixel_center = float(choice(given, "pixel_center", where, PIXEL_CENTERS))
     unit = settings.depth_scale
     if unit is None and "depth_unit" in given:
         unit = positive(given, "depth_unit", where)
-    intrinsics = shift_principal_point(_intrinsics(entry, where, len(color)), 0.5 - pixel_center)
-    poses = _poses(entry, where, len(color))
+    intrinsics = shift_principal_point(view_intrinsics(entry, where, len(color)), 0.5 - pixel_center)
+    poses = view_poses(entry, where, len(color))
+    sensor = None
+    if "depth_camera" in entry:
+        sensor = depth_camera(entry, where, pixel_center, depth_size(depth[0]))
     conventions = {"axes": axes, "depth_type": depth_type, "pixel_center": f"{pixel_center:.1f}"}
     if unit is not None:
         conventions["depth_unit"] = f"{unit:.12g}"
@@ -185,7 +206,8 @@ def _view(
         depth=depth,
         intrinsics=intrinsics,
         cam_to_world=opengl_to_opencv(poses) if axes == "opengl" else poses,
-        distortion=_distortion(entry, where),
+        distortion=view_distortion(entry, where),
+        depth_camera=sensor,
         depth_type=depth_type,
         depth_unit=unit,
         conventions=conventions,
@@ -213,65 +235,6 @@ def _frames(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
                 "time: cut the recording there into two folders."
             )
     return files
-
-
-def _intrinsics(entry: Mapping[str, Any], where: str, num_frames: int) -> NDArray[np.float64]:
-    if "K" in entry:
-        return _per_frame(entry["K"], num_frames, f"{where}: 'K'", checked_intrinsics)
-    names = ("fx", "fy", "cx", "cy")
-    lists = [entry[name] for name in names if isinstance(entry.get(name), list)]
-    if not lists:
-        matrix = camera_matrix(*(number(entry, name, where) for name in names))
-        return checked_intrinsics(matrix, f"{where}: fx, fy, cx, cy")
-    if any(len(values) != num_frames for values in lists):
-        raise DataError(f"{where}: fx, fy, cx, cy have one entry each, or one per frame ({num_frames}).")
-    rows = [
-        {name: entry[name][i] if isinstance(entry.get(name), list) else entry.get(name) for name in names}
-        for i in range(num_frames)
-    ]
-    return np.stack(
-        [
-            checked_intrinsics(
-                camera_matrix(*(number(row, name, f"{where}, frame {i}") for name in names)), f"{where}, frame {i}"
-            )
-            for i, row in enumerate(rows)
-        ]
-    )
-
-
-def _poses(entry: Mapping[str, Any], where: str, num_frames: int) -> NDArray[np.float64]:
-    given = [name for name in ("cam_to_world", "world_to_cam") if name in entry]
-    if len(given) != 1:
-        raise DataError(f"{where}: give one of 'cam_to_world' and 'world_to_cam' (4x4, or one 4x4 per frame).")
-    poses = _per_frame(entry[given[0]], num_frames, f"{where}: {given[0]!r}", checked_pose)
-    return invert_pose(poses) if given[0] == "world_to_cam" else poses
-
-
-def _per_frame(values: Any, num_frames: int, where: str, check: Any) -> NDArray[np.float64]:
-    """Check one matrix, or a list with one matrix per frame; errors name the frame."""
-    if _depth(values) <= 2:
-        return check(values, where)
-    if len(values) != num_frames:
-        raise DataError(f"{where} has {len(values)} matrices; there are {num_frames} frames.")
-    return np.stack([check(value, f"{where}, frame {index}") for index, value in enumerate(values)])
-
-
-def _depth(values: Any) -> int:
-    """Return how many lists lie in each other, up to 4."""
-    depth = 0
-    while isinstance(values, list) and values and depth < 4:
-        values, depth = values[0], depth + 1
-    return depth
-
-
-def _distortion(entry: Mapping[str, Any], where: str) -> NDArray[np.float64] | None:
-    values = entry.get("distortion")
-    if values is None:
-        return None
-    is_list = isinstance(values, list) and all(isinstance(x, int | float) for x in values)
-    if not is_list or len(values) not in (4, 5, 8) or not np.isfinite(values).all():
-        raise DataError(f"{where}: 'distortion' is {values!r}; OpenCV's k1 k2 p1 p2 k3 (4, 5 or 8 numbers) are needed.")
-    return np.array([*values, 0.0] if len(values) == 4 else values, np.float64)
 
 
 def _distortions(views: list[_View]) -> NDArray[np.float64] | None:

@@ -1,4 +1,6 @@
-"""ROS 1 bags, ROS 2 bags (SQLite, MCAP) and recordings of RealSense cameras with depth aligned to colour.
+"""ROS 1 bags, ROS 2 bags (SQLite, MCAP) and recordings of RealSense cameras.
+
+Depth is aligned to colour, or is registered to it here where the bag has the depth sensor's calibration and its place.
 
 Frames are the colour images of the first camera; a depth image, and the images of other cameras, belong to them when
 they are the nearest in time and within ``max_time_difference``. Each camera's pose is that of its optical frame (x
@@ -18,16 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.importers.conventions import distance_to_z, opengl_to_opencv, shift_principal_point
+from data_gen.importers.depth_registration import DepthCamera
 from data_gen.importers.frame_times import Times, nearest, pose_gap, runs_without_gap, usual_step
 from data_gen.importers.recording import MIN_FRAMES, Recording
 from data_gen.importers.ros_cameras import (
     Calibration,
     ImageTopic,
     calibration,
+    depth_sensor,
     find_camera,
     image_topic,
     info_topic,
-    require_aligned,
 )
 from data_gen.importers.ros_file import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS, Bag, Entry, bag_paths
 from data_gen.importers.ros_images import colour_image, depth_image
@@ -83,6 +86,7 @@ class _Camera:
     entries: list[Entry]
     depth_times: Times
     depth_entries: list[Entry]
+    sensor: DepthCamera | None  # of depth that is not aligned to colour
 
 
 def _bag_recordings(bag: Bag, mapping: RosMapping, settings: ImportSettings) -> Iterator[Recording]:
@@ -189,7 +193,8 @@ def _camera(
     for image, info in zip((camera.rgb, camera.depth), _info_topics(camera, topics), strict=True):
         if info is not None and (image == camera.rgb or not camera.is_aligned):
             calibrations[image] = calibration(contents.infos[info], images[image], f"{bag.path}, {info}")
-    require_aligned(camera, images[camera.rgb], images[camera.depth], calibrations, str(bag.path))
+    pair = images[camera.rgb], images[camera.depth]
+    sensor = depth_sensor(camera, *pair, calibrations, contents.tree, str(bag.path))
     if camera.rgb not in calibrations:
         wanted = camera.info or f"{camera.rgb.rpartition('/')[0]}/camera_info"
         raise DataError(
@@ -199,9 +204,7 @@ def _camera(
     times, entries = _in_order(contents.images[camera.rgb])
     depth_times, depth_entries = _in_order(contents.images[camera.depth])
     scale = settings.depth_scale or camera.depth_scale or _depth_unit(camera.depth, contents) or _METRES_PER_STEP
-    return _Camera(
-        camera, images[camera.rgb], calibrations[camera.rgb], scale, times, entries, depth_times, depth_entries
-    )
+    return _Camera(camera, pair[0], calibrations[camera.rgb], scale, times, entries, depth_times, depth_entries, sensor)
 
 
 def _poses(
@@ -245,8 +248,9 @@ def _recording(
         np.pad(camera.calibration.distortion, (0, size - camera.calibration.distortion.size)) for camera in cameras
     ]
 
-    def checked(image: NDArray[Any], topic: str) -> NDArray[Any]:
-        if image.shape[:2] != (first.height, first.width):
+    def checked(image: NDArray[Any], topic: str, sensor: DepthCamera | None = None) -> NDArray[Any]:
+        taken_by = sensor or first
+        if image.shape[:2] != (taken_by.height, taken_by.width):
             raise DataError(f"{bag.path}: images on {topic} change their size while recording.")
         return image
 
@@ -258,9 +262,12 @@ def _recording(
         camera, topic = cameras[view], cameras[view].topics.depth
         message = bag.message(topic, depth[view][frame])
         metres = depth_image(message, camera.depth_scale, settings.depth_scale or 1.0, f"{bag.path}, {topic}")
+        metres = checked(metres, topic, camera.sensor)
         if chosen(settings.depth, "z") == "distance":
-            return distance_to_z(checked(metres, topic), intrinsics[view], distortions[view] if size else None)
-        return checked(metres, topic).astype(np.float32)
+            if camera.sensor is not None:
+                return distance_to_z(metres, camera.sensor.intrinsics, camera.sensor.distortion)
+            return distance_to_z(metres, intrinsics[view], distortions[view] if size else None)
+        return metres.astype(np.float32)
 
     is_still = bool((poses == poses[0]).all())
     return Recording(
@@ -280,8 +287,9 @@ def _recording(
             "depth_type": chosen(settings.depth, "z"),
             "depth_unit": ",".join(f"{camera.depth_scale:.9g}" for camera in cameras),
             "pixel_center": chosen(settings.pixel_center, "0.0"),
-            "cameras": ",".join(camera.topics.name or camera.topics.rgb for camera in cameras),
         },
+        depth_cameras=[camera.sensor for camera in cameras],
+        view_names=[camera.topics.name or camera.topics.rgb for camera in cameras],
         distortion=np.stack(distortions) if size else None,
     )
 

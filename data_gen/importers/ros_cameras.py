@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data_gen.importers.conventions import camera_matrix, checked_intrinsics
+from data_gen.importers.conventions import camera_matrix, checked_intrinsics, shift_principal_point
+from data_gen.importers.depth_registration import DepthCamera
 from data_gen.importers.ros_images import COLOUR_ENCODINGS, DEPTH_ENCODINGS, describe
 from data_gen.importers.ros_mapping import CameraTopics
-from data_gen.importers.ros_transforms import frame_name
+from data_gen.importers.ros_transforms import TransformTree, frame_name
 from vpd_lightning.errors import DataError
 
 _TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
@@ -19,7 +20,8 @@ _PINHOLE_MODELS = ("plumb_bob", "rational_polynomial", "brown conrady")
 _SAME_CALIBRATION = 1e-3  # relative
 _ALIGN_HINT = (
     "Record depth aligned to colour: realsense2_camera with align_depth:=true (ROS 2: align_depth.enable:=true),\n"
-    "and take .../aligned_depth_to_color/image_raw. Where they do fit, say is_aligned: true in mapping=FILE."
+    "and take .../aligned_depth_to_color/image_raw. Or record the depth sensor's camera_info and tf between the\n"
+    "two frames, and it is registered here. Where they do fit, say is_aligned: true in mapping=FILE."
 )
 
 
@@ -71,6 +73,8 @@ def find_camera(images: Sequence[ImageTopic], where: str) -> CameraTopics:
         what = "colour and depth" if not depth and not colour else "depth" if not depth else "colour"
         raise DataError(f"{where} has no {what} images of a known encoding. Its images:\n{listed}")
     pairs = [(c, d) for c in colour for d in depth if _misalignment(c, d) is None]
+    if not pairs and len(colour) == len(depth) == 1 and colour[0].frame != depth[0].frame:
+        pairs = [(colour[0], depth[0])]  # two sensors; whether depth can be registered, the calibrations say
     if not pairs:
         raise DataError(f"{where}: {_misalignment(colour[0], depth[0])}.\n{_ALIGN_HINT}")
     if len(pairs) > 1:
@@ -90,28 +94,41 @@ def info_topic(image: str, topics: Mapping[str, str] | Sequence[str]) -> str | N
     return next((topic for topic in candidates if topic in topics), None)
 
 
-def require_aligned(
-    camera: CameraTopics, colour: ImageTopic, depth: ImageTopic, infos: Mapping[str, Calibration], where: str
-) -> None:
-    """Refuse depth that is not taken through the colour camera's pixels.
+def depth_sensor(
+    camera: CameraTopics,
+    colour: ImageTopic,
+    depth: ImageTopic,
+    infos: Mapping[str, Calibration],
+    tree: TransformTree,
+    where: str,
+) -> DepthCamera | None:
+    """Return the sensor of depth that is to be registered to colour; None where it is aligned already.
 
     Args:
         camera: the two topics.
         colour: its first colour image.
         depth: its first depth image.
         infos: calibrations by image topic, where the bag has one.
+        tree: where the frames of the two lie to each other.
         where: said in errors.
 
     Raises:
-        DataError: sizes, frames or calibrations differ.
+        DataError: sizes, frames or calibrations differ, and the bag does not say how the two lie to each other.
     """
     fault = _misalignment(colour, depth)
     own, other = infos.get(camera.rgb), infos.get(camera.depth)
     if fault is None and own is not None and other is not None and not _is_same(own, other):
         fault = f"{camera.depth} has another calibration than {camera.rgb}: depth is not aligned to colour"
     is_same_size = (colour.height, colour.width) == (depth.height, depth.width)
-    if fault is not None and not (camera.is_aligned and is_same_size):
+    if fault is None or camera.is_aligned and is_same_size:
+        return None
+    to_color = tree.fixed_pose(depth.frame, colour.frame) if colour.frame != depth.frame else None
+    if other is None or to_color is None:
         raise DataError(f"{where}: {fault}.\n{_ALIGN_HINT}")
+    intrinsics = shift_principal_point(other.intrinsics, 0.5)
+    return DepthCamera(
+        depth.height, depth.width, intrinsics, to_color, other.distortion if other.distortion.size else None
+    )
 
 
 def calibration(info: Any, image: ImageTopic, where: str) -> Calibration:

@@ -87,6 +87,18 @@ class TransformTree:
         world_in_shared, also_known = self._climb(above_world[: above_world.index(shared)], times, max_gap)
         return invert_pose(world_in_shared) @ frame_in_shared, known & also_known
 
+    def fixed_pose(self, frame: str, other: str) -> NDArray[np.float64] | None:
+        """Return the pose (4, 4) of a frame in another that never moves against it; None where there is none."""
+        frame, other = frame_name(frame), frame_name(other)
+        above, above_other = self._chain(frame), self._chain(other)
+        shared = next((name for name in above if name in above_other), None)
+        if shared is None:
+            return None
+        between = [*above[: above.index(shared)], *above_other[: above_other.index(shared)]]
+        if not all(name in self._static for name in between):
+            return None
+        return self.poses(frame, other, np.zeros(1, np.int64), 0)[0][0]
+
     def _chain(self, frame: str) -> list[str]:
         """Return a frame and all frames above it."""
         chain = [frame]

@@ -24,11 +24,12 @@ from vpd_lightning.data.manifest import SPLITS, file_sha256
 from vpd_lightning.data.schema import write_trajectory
 from vpd_lightning.errors import ConfigError, DataError
 
-VERSION = 2  # of what the importers make from the same source and settings
+VERSION = 3  # of what the importers make from the same source and settings
 _PACKAGES = ("numpy", "h5py", "opencv-python-headless", "vpd-lightning")
 _MAPPED = ("ros", "lerobot", "tum")
 SCENE = "recordings"  # the manifest's scene
 _BYTES_PER_PIXEL = 7  # uint8 RGB, float32 depth
+_SAID = ("estimated", "ground")  # of the bounds: how they were found
 _NOT_IN_FILES = ("format", "mapping", "workers")  # they decide nothing beyond what stands elsewhere in the identity
 _WORTH_WORKERS = 512 * 2**20  # bytes of images, below which starting processes takes longer than they save
 _ENCODER_STEP = 16  # sides that the paper's encoder can halve and double again
@@ -109,7 +110,7 @@ def _make(
             advance()
         return hashes
     seed = plan.settings.seed
-    job = ImportJob(plan.source, replace(plan.settings, format=plan.format), (plan.frame, plan.bounds))
+    job = ImportJob(plan.source, replace(plan.settings, format=plan.format), plan.found)
     jobs = {path: (seed, clip.split, int(path.stem), path, scene_hash) for path, clip in missing.items()}
     made = run_jobs(jobs, ("importers.clip_scene", job, "", None), environment(""), num_workers, advance)
     return {path: file.sha256 for path, file in made.items()}
@@ -125,8 +126,9 @@ def _identity(plan: ImportPlan) -> dict[str, Any]:
     """Return everything that decides what the files hold, but for the pixels themselves."""
     digest = hashlib.sha256()
     for clip in plan.clips:
-        recording = clip.recording
+        recording = plan.sources[clip.recording.name]  # as given: refined poses differ in their last digits by machine
         arrays = [recording.intrinsics, recording.cam_to_world, recording.distortion]
+        arrays += [array for camera in recording.depth_cameras if camera is not None for array in camera.arrays()]
         facts = (recording.name, recording.height, recording.width, recording.num_frames, recording.frame_time)
         digest.update(repr((facts, sorted(recording.source.items()), clip.path.as_posix(), clip.frames)).encode())
         for array in arrays:
@@ -140,7 +142,7 @@ def _identity(plan: ImportPlan) -> dict[str, Any]:
         "settings": {name: value for name, value in asdict(plan.settings).items() if name not in _NOT_IN_FILES},
         "mapping": file_sha256(Path(plan.settings.mapping))[:16] if plan.settings.mapping else "",
         "cameras_and_frames": digest.hexdigest()[:16],
-        "bounds": {name: value for name, value in asdict(plan.bounds).items() if name != "estimated"},
+        "bounds": {name: value for name, value in asdict(plan.bounds).items() if name not in _SAID},
     }
 
 

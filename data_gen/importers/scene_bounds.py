@@ -19,6 +19,11 @@ _FRAMES_EACH = 3
 _POINTS_PER_IMAGE = 4000
 _OUTLIERS = 0.01  # share of the points left out on each side of each axis: stray measurements, far corners
 _MARGIN = 0.05  # of each side, added on both sides
+_ROOM = 0.5  # of the longer horizontal side of what stands on the ground, on each side of it
+_LEAST_ROOM = 0.15  # of the median distance
+_BAND = 0.01  # of the median distance: how far points of a level ground may lie above or below it
+_GROUND = 0.2  # share of the points that a ground has at least
+_STANDING = 0.01  # share of the points that must stand above it, for it to be cut off around them
 _STRAY = 0.001  # share of the points in the workspace that may lie before near
 
 
@@ -31,6 +36,7 @@ class SceneBounds:
     workspace_min: tuple[float, float, float]
     workspace_max: tuple[float, float, float]
     estimated: tuple[str, ...]  # names of the settings that were not given
+    ground: float | None = None  # m: height of a level ground whose far end was left out
 
     def __str__(self) -> str:
         lower, upper = (",".join(f"{x:g}" for x in corner) for corner in (self.workspace_min, self.workspace_max))
@@ -73,14 +79,15 @@ def sample_points(geometries: Sequence[ImageGeometry], frame: WorldFrame, every:
 def scene_bounds(points: SampledPoints, shift: Array, settings: ImportSettings) -> SceneBounds:
     """Return the given bounds, and estimates for those that are not given.
 
-    The workspace holds all but 1 % of the points on each side of each axis, and 5 % more room; near and far hold what
-    is in it, 10 % wider.
+    The workspace holds all but 1 % of the points on each side of each axis, and 5 % more room; a level ground counts
+    only around what stands on it. Near and far hold what is in it, 10 % wider.
 
     Raises:
         DataError: nothing lies in the given workspace, or the given and the estimated values contradict each other.
     """
     positions = points.positions + shift
     lower, upper = np.quantile(positions, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
+    lower, upper, ground = _without_far_ground(positions, lower, upper, float(np.median(points.distances)))
     sides = np.maximum(upper - lower, 0.02 * max((upper - lower).max(), 0.05))  # a mere plane needs some height
     middle = (lower + upper) / 2
     step = 10.0 ** math.floor(math.log10(sides.max())) / 100
@@ -113,7 +120,32 @@ def scene_bounds(points: SampledPoints, shift: Array, settings: ImportSettings) 
         (workspace_min[0], workspace_min[1], workspace_min[2]),
         (workspace_max[0], workspace_max[1], workspace_max[2]),
         tuple(name for name in names if getattr(settings, name) is None),
+        None if settings.workspace_min and settings.workspace_max else ground,
     )
+
+
+def _without_far_ground(
+    positions: Array, lower: Array, upper: Array, distance: float
+) -> tuple[Array, Array, float | None]:
+    """Cut the box (3,), (3,) to what stands on a level ground, with room around it; return the ground's height, too.
+
+    The box stays as it is, and the height is None, where there is no such ground or nothing stands on it.
+    """
+    band = _BAND * distance
+    levels = np.round(positions[:, 2] / band)
+    values, counts = np.unique(levels, return_counts=True)
+    level = float(np.median(positions[levels == values[counts.argmax()], 2]))
+    above = positions[:, 2] - level
+    standing = positions[above > 2 * band]
+    if (np.abs(above) <= band).mean() < _GROUND or len(standing) < _STANDING * len(positions):
+        return lower, upper, None
+    low, high = np.quantile(standing[:, :2], [_OUTLIERS, 1 - _OUTLIERS], axis=0)
+    room = max(_ROOM * float((high - low).max()), _LEAST_ROOM * distance)
+    cut_lower, cut_upper = lower.copy(), upper.copy()
+    cut_lower[:2], cut_upper[:2] = np.maximum(lower[:2], low - room), np.minimum(upper[:2], high + room)
+    if np.array_equal(cut_lower, lower) and np.array_equal(cut_upper, upper):
+        return lower, upper, None
+    return cut_lower, cut_upper, level
 
 
 def _step(num_frames: int, every: int) -> int:

@@ -51,6 +51,8 @@ class ImportSettings:
     flying_pixels: float | None = None  # remove pixels in the air between surfaces: jumps of this share of depth (0.02)
     smooth: float | None = None  # pixels of the source: radius of an edge-preserving filter
     fill_holes: int | None = None  # frames back from which a fixed camera's holes may be filled
+    # Poses of cameras that stand still: lay what they see onto each other (ICP); the first view stays
+    refine_poses: bool = False
     # Conventions of the source, where it does not say or says it wrongly
     depth: str = AUTO  # z (along the optical axis) | distance (to the camera centre)
     depth_scale: float | None = None  # metres per unit of the depth images

@@ -42,7 +42,7 @@ def draw_cameras(reader: TrajectoryReader) -> "Figure":
             if not reader.is_static_cameras:
                 panel.plot(centers[:, view, right], centers[:, view, up], color=color, linewidth=0.8, alpha=0.6)
             if reader.num_views <= _MAX_LABELS:
-                panel.annotate(str(view), (center[right], center[up]), color=color, fontsize=9)
+                panel.annotate(reader.view_label(view), (center[right], center[up]), color=color, fontsize=9)
         panel.set_title(title)
         panel.set_xlabel("xyz"[right] + " (m)")
         panel.set_ylabel("xyz"[up] + " (m)")

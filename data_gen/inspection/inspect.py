@@ -94,6 +94,7 @@ def describe(path: str | Path) -> str:
             f"{reader.width}x{reader.height}, {'fixed' if reader.is_static_cameras else 'moving'} cameras",
             f"cameras        {heights.min():.2f} to {heights.max():.2f} m high, vertical field of view "
             f"{field_of_view.min():.1f} to {field_of_view.max():.1f} degrees",
+            *([f"views          {', '.join(reader.view_names)}"] if reader.view_names else []),
             f"depth          {extent}, {measured.size / depth.size:.1%} of the pixels of the first frame",
             f"workspace      {_vector(reader.workspace_min)} to {_vector(reader.workspace_max)} m, "
             f"near {reader.near:g}, far {reader.far:g} m",

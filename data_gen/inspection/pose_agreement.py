@@ -8,6 +8,7 @@ floor, counts as right.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,6 +48,22 @@ class Misplacement:
         return self.distance > MAX_MISPLACED * self.depth + _SURE * self.error
 
 
+class SurfaceOffsets(NamedTuple):
+    """Points of one view and how far they lie from the surfaces of another, along normals.
+
+    Attributes:
+        points: (point, 3), world, metres.
+        normals: (point, 3), world.
+        distances: (point,), metres along the normal to the other view's surface.
+        depth: (point,), metres, of the point in its own view.
+    """
+
+    points: Array
+    normals: Array
+    distances: Array
+    depth: Array
+
+
 def misplacements(reader: TrajectoryReader, max_pairs: int) -> list[Misplacement]:
     """Compare views of one moment, pair by pair; pairs that share too few surfaces are left out.
 
@@ -62,10 +79,11 @@ def misplacements(reader: TrajectoryReader, max_pairs: int) -> list[Misplacement
     found = []
     for first, second in pairs:
         parts = [
-            _residuals(images[time, first], surfaces[time, first], images[time, second], surfaces[time, second])
+            surface_offsets(images[time, first], surfaces[time, first], images[time, second], surfaces[time, second])
             for time in times
         ]
-        found.append(_misplacement((first, second), *(np.concatenate(part) for part in zip(*parts, strict=True))))
+        joined = SurfaceOffsets(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        found.append(_misplacement((first, second), joined))
     return [item for item in found if item is not None]
 
 
@@ -83,9 +101,8 @@ def outlier_view(found: Sequence[Misplacement]) -> tuple[int, Misplacement] | No
     return worst, max((item for item in certain if worst in item.views), key=lambda item: item.distance)
 
 
-def _misplacement(
-    views: tuple[int, int], points: Array, normals: Array, residuals: Array, depth: Array
-) -> Misplacement | None:
+def _misplacement(views: tuple[int, int], offsets: SurfaceOffsets) -> Misplacement | None:
+    points, normals, residuals, depth = offsets
     if len(points) < _MIN_POINTS:
         return None
     center = points.mean(axis=0)
@@ -116,12 +133,12 @@ def _motion(motions: Array, residuals: Array) -> tuple[Array, Array, Array]:
     return (axes.T @ (motions.T @ residuals)) / values, values, axes
 
 
-def _residuals(
-    here: PosedDepth, surface: SmoothSurface, other: PosedDepth, other_surface: SmoothSurface
-) -> tuple[Array, Array, Array, Array]:
-    """Return points of one view, their normals (world), metres along these to the other's surface, and their depth."""
+def surface_offsets(
+    here: PosedDepth, surface: SmoothSurface, other: PosedDepth, other_surface: SmoothSurface, spacing: int = _SPACING
+) -> SurfaceOffsets:
+    """Compare points of one view, ``spacing`` pixels apart, with the planes of the pixels that show them in another."""
     chosen = np.zeros_like(surface.is_sure)
-    chosen[::_SPACING, ::_SPACING] = surface.is_sure[::_SPACING, ::_SPACING]
+    chosen[::spacing, ::spacing] = surface.is_sure[::spacing, ::spacing]
     rows, columns = np.nonzero(chosen)
     depth = here.depth[rows, columns].astype(np.float64)
     rotation = here.cam_to_world[:3, :3]
@@ -144,4 +161,4 @@ def _residuals(
     sign = np.where(alike < 0, -1.0, 1.0)
     near = np.abs(other.depth[row, column] - seen[:, 2]) <= _REACH * seen[:, 2]
     kept = in_image & other_surface.is_sure[row, column] & near & (np.abs(alike) > 0.9)
-    return points[kept], normals[kept], (sign * distance)[kept], depth[kept]
+    return SurfaceOffsets(points[kept], normals[kept], (sign * distance)[kept], depth[kept])

@@ -34,12 +34,15 @@ def smooth_surface(image: PosedDepth) -> SmoothSurface:
     near = minimum_filter(np.where(valid, image.depth, np.inf), 3)
     rows, columns = np.indices(image.depth.shape)
     directions = rays(image.intrinsics, columns.ravel(), rows.ravel()).reshape(*image.depth.shape, 3)
-    total = uniform_filter(np.where(valid, image.depth, 0.0).astype(np.float64), _WINDOW)
+    # Inverse depth is linear across a plane: its mean over the window is that of the middle.
+    total = uniform_filter(np.where(valid, 1 / np.where(valid, image.depth, 1.0), 0.0).astype(np.float64), _WINDOW)
     share = uniform_filter(valid.astype(np.float64), _WINDOW)
-    points = directions * (total / np.maximum(share, 1e-9))[..., None]
+    points = directions * (share / np.maximum(total, 1e-9))[..., None]
     crossed = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
     length = np.linalg.norm(crossed, axis=-1)
     normals = crossed / np.maximum(length, 1e-30)[..., None]
     along = np.abs((normals * directions).sum(axis=-1))
     is_grazed = along * np.sqrt(1 + _GRAZING**2) < np.linalg.norm(directions, axis=-1)
-    return SmoothSurface(normals, valid & (length > 0) & (far - near <= _MAX_STEP * far) & ~is_grazed)
+    is_whole = np.zeros_like(valid)
+    is_whole[_WINDOW // 2 + 1 : -_WINDOW // 2, _WINDOW // 2 + 1 : -_WINDOW // 2] = True  # no window beyond the picture
+    return SmoothSurface(normals, valid & is_whole & (length > 0) & (far - near <= _MAX_STEP * far) & ~is_grazed)

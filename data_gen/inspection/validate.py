@@ -208,9 +208,10 @@ def _judge_poses(path: Path, found: Sequence[Misplacement]) -> list[Fault]:
     if worst is None:
         return []
     view, pair = worst
-    other = pair.views[0] if pair.views[1] == view else pair.views[1]
+    with TrajectoryReader(path) as reader:
+        name, other = (reader.view_label(one) for one in (view, sum(pair.views) - view))
     message = (
-        f"the pose of view {view} is off: its surfaces lie {100 * pair.distance:.2g} cm (standard error "
+        f"the pose of view {name} is off: its surfaces lie {100 * pair.distance:.2g} cm (standard error "
         f"{100 * pair.error:.1g} cm) from those of view {other}, {_percent(pair.distance / pair.depth)} of their "
         f"depth; allowed {_percent(MAX_MISPLACED)}. Calibrate it again (pose, principal point), or trigger the cameras "
         "together"
@@ -227,7 +228,9 @@ def _judge_free_space(path: Path, free_space: FreeSpace) -> Fault:
         noise = f"; the depth's noise of {_percent(free_space.noise)} explains it"
         return Fault("free_space", str(path), message + noise, is_error=False)
     first, second = max(free_space.pairs, key=free_space.pairs.__getitem__)
-    worst = f"; most are points of view {first} seen from view {second} ({free_space.pairs[first, second]:.1%})"
+    with TrajectoryReader(path) as reader:
+        names = [reader.view_label(view) for view in (first, second)]
+    worst = f"; most are points of view {names[0]} seen from view {names[1]} ({free_space.pairs[first, second]:.1%})"
     return Fault("free_space", str(path), message + worst)
 
 

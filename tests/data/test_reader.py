@@ -47,6 +47,18 @@ def test_unmeasured_depth_reads_as_zero(tmp_path: Path):
     assert not depth[0, 0, 0, :3].any()
 
 
+def test_views_have_the_names_of_the_source_where_it_has_some(path: Path, tmp_path: Path):
+    with TrajectoryReader(path) as reader:
+        assert (reader.view_names, reader.view_label(1)) == ((), "1")
+    named = make_trajectory(5, num_views=3)
+    write_trajectory(
+        tmp_path / "named.h5", replace(named, attributes={"view_names": '["left", "the\\nmiddle", "right"]'})
+    )
+    with TrajectoryReader(tmp_path / "named.h5") as reader:
+        assert reader.view_names == ("left", "the middle", "right")
+        assert reader.view_label(2) == "2 (right)"
+
+
 def test_moving_cameras_are_read_per_frame(tmp_path: Path):
     trajectory = make_trajectory(1, num_frames=4)
     poses = np.repeat(trajectory.cam_to_world[None], 4, axis=0)

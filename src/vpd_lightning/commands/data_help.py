@@ -26,7 +26,7 @@ HELP = f"""vpd-data: make, bring in, look at and check data sets of posed RGB-D 
       format    plain (images, depth, cameras.json), transforms (nerfstudio, instant-ngp), kubric, movi (TFDS records),
                 tum (TUM RGB-D), ros (bags), lerobot; auto recognises them
       SETTING   every=2 clip_frames=48 height=128 width=128 crop=[0,0,480,480] frame_time=0.05
-                flying_pixels=0.02 smooth=2 fill_holes=10 (cleaning depth)
+                flying_pixels=0.02 smooth=2 fill_holes=10 (cleaning depth) refine_poses=true (fixed cameras)
                 near=0.3 far=3 workspace_min=[-1,-1,0] workspace_max=[1,1,1] splits.test=0.2
                 depth=z|distance depth_scale=0.001 axes=opencv|opengl pixel_center=0.5|0.0 scale=... up=z mapping=FILE
 

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from vpd_lightning.data import schema
 from vpd_lightning.data.camera_checks import check_intrinsics, check_poses
 from vpd_lightning.data.hdf5.broken_file import refuse
-from vpd_lightning.data.hdf5.checks import checked_attribute, checked_dataset, named_damage, open_file
+from vpd_lightning.data.hdf5.checks import (
+    checked_attribute,
+    checked_dataset,
+    checked_view_names,
+    named_damage,
+    open_file,
+)
 from vpd_lightning.data.hdf5.image_chunks import ImageChunks
 from vpd_lightning.data.hdf5.stored_chunks import read_whole
 
@@ -103,6 +109,15 @@ class TrajectoryReader:
     def scene_hash(self) -> str:
         """What the file was made from (see ``data_gen``); empty for recordings."""
         return self._attributes()["scene_hash"]
+
+    @property
+    def view_names(self) -> tuple[str, ...]:
+        """What the source of a recording calls its views; empty where it has no names."""
+        return self._attributes()["view_names"]
+
+    def view_label(self, view: int) -> str:
+        """Return a view's number, and its name where it has one."""
+        return f"{view} ({self.view_names[view]})" if self.view_names else str(view)
 
     # -- reading -------------------------------------------------------------------------------------------------------
 
@@ -226,6 +241,7 @@ class TrajectoryReader:
                 values[key] = checked_attribute(path, depth, key, "number")
             if values["scale"] <= 0:
                 raise refuse(path, "depth_scale", f"'depth' has scale {values['scale']}; it must be positive")
+        values["view_names"] = checked_view_names(path, file, view)
         self._values = {**values, "shape": (time, view, height, width)}
         self._chunks = {schema.RGB: ImageChunks(path, rgb), schema.DEPTH: ImageChunks(path, depth)}
         self._cameras = (

@@ -9,7 +9,7 @@ Readable with h5py alone::
     cam_to_world (view, 4, 4) or (time, view, 4, 4) float64    OpenCV camera axes, metres
     state/       optional ground truth, for evaluation only (see ``data.ground_truth``)
     attributes   schema_version, frame_time (s), near, far (m along the ray), workspace_min, workspace_max (m),
-                 depth_type = "z", source_depth_type, seed, engine, scene_hash
+                 depth_type = "z", source_depth_type, seed, engine, scene_hash; recordings: view_names (a JSON list)
 """
 
 from collections.abc import Mapping
@@ -26,6 +26,7 @@ from vpd_lightning.files import AtomicPath
 SCHEMA_VERSION = 1
 DEPTH_TYPE = "z"
 RGB, DEPTH, INTRINSICS, CAM_TO_WORLD, STATE = "rgb", "depth", "intrinsics", "cam_to_world", "state"
+VIEW_NAMES = "view_names"
 STATE_POSITIONS = "positions"  # (time, object, 3) m, world
 STATE_QUATERNIONS = "quaternions"  # (time, object, 4) w x y z, body to world
 STATE_LINEAR_VELOCITIES = "linear_velocities"  # (time, object, 3) m/s, world, of the centre of mass

@@ -28,11 +28,14 @@ class MovingPixels:
     moving: Bool[np.ndarray, "time view height width"]
     in_workspace: Bool[np.ndarray, "time view height width"]
     noise: Float[np.ndarray, " view"]
+    view_names: tuple[str, ...] = ()
 
     def summary(self) -> list[str]:
         """Return lines for a person, with a warning where depth is too noisy."""
         share = self.moving.sum() / max(int(self.in_workspace.sum()), 1)
-        views = "" if len(self.noise) < 2 else f" (by view {', '.join(f'{100 * value:.2f}' for value in self.noise)})"
+        names = [f"{name} " for name in self.view_names] or [""] * len(self.noise)
+        each = ", ".join(f"{name}{100 * value:.2f}" for name, value in zip(names, self.noise, strict=True))
+        views = f" (by view {each})" if len(self.noise) > 1 else ""
         lines = [
             f"depth noise    {100 * np.median(self.noise):.2f} % of depth{views}",
             f"may move       {share:.1%} of the pixels in the workspace, for model=inertial",
@@ -58,6 +61,7 @@ def find_moving_pixels(path: Path) -> MovingPixels:
         frames = RGBDFrames(
             torch.from_numpy(reader.rgb(times, views)), torch.from_numpy(depth), read_cameras(reader, times, views)
         )
+        names = reader.view_names
         corners = {name: list(getattr(reader, name)) for name in ("workspace_min", "workspace_max")}
     words = [f"scene.{name}={corner}" for name, corner in corners.items()]
     config = compose("train", ["experiment=recordings", "size=small", "data.folder=unused", *words])
@@ -65,4 +69,4 @@ def find_moving_pixels(path: Path) -> MovingPixels:
     assert isinstance(encoder, UnprojectingEncoder)
     moving, in_workspace = encoder.moving_pixels(frames)
     noise = np.median([relative_noise(one.astype(np.float64), one > 0) for one in depth], axis=0)
-    return MovingPixels(times, moving.numpy(), in_workspace.numpy(), noise)
+    return MovingPixels(times, moving.numpy(), in_workspace.numpy(), noise, names)

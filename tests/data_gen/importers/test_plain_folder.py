@@ -10,7 +10,7 @@ from data_gen.importers.run import import_recordings
 from data_gen.inspection.validate import validate_dataset
 from tests.data_gen.importers import known_scene
 from tests.data_gen.importers.checks import TOLERANCE, assert_valid, attributes, camera_errors, files, worst_point
-from tests.data_gen.importers.plain_recording import HEIGHT, WIDTH, change, write_plain
+from tests.data_gen.importers.plain_recording import HEIGHT, MM, WIDTH, change, write_plain
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.errors import DataError
 
@@ -241,3 +241,51 @@ def test_mistakes_are_named(tmp_path: Path, kind: str, message: str):
         import_recordings(source, tmp_path / "out")
     assert len(str(caught.value).splitlines()) <= 3
     assert not files(tmp_path / "out")
+
+
+def _with_sensor(source: Path, **changes: object) -> None:
+    """Replace view 0's depth by that of a sensor of 96 x 128 pixels, 4 cm beside the colour camera."""
+    content = json.loads((source / "cameras.json").read_text())
+    view = content["views"][0]
+    to_color = np.eye(4)
+    to_color[:3, 3] = [0.04, 0.0, 0.01]
+    matrix, _ = known_scene.camera(10.0, 45.0, 2.0, 96, 128)
+    pose = np.array(view["cam_to_world"]) @ to_color
+    for file in sorted((source / view["name"] / "depth").iterdir()):
+        picture = known_scene.render(matrix, pose, 96, 128, int(file.stem) * known_scene.FRAME_TIME)
+        cv2.imwrite(str(file), np.rint(picture.depth / MM).astype(np.uint16))
+    view["depth_camera"] = {"K": matrix.tolist(), "depth_to_color": to_color.tolist(), **changes}
+    (source / "cameras.json").write_text(json.dumps(content))
+
+
+def test_depth_of_a_sensor_beside_the_colour_camera_is_registered(tmp_path: Path):
+    source = write_plain(tmp_path / "take")
+    _with_sensor(source)
+    imported = import_recordings(source, tmp_path / "out", {"splits.train": 1.0})
+    (path,) = files(imported)
+    with TrajectoryReader(path) as reader:
+        depth, (intrinsics, poses) = reader.depth([0])[0], reader.cameras([0])
+        assert reader.view_names == ("view0", "view1", "view2")
+    for view in (0, 1):
+        points = known_scene.unproject(depth[view], intrinsics[0, view], poses[0, view])
+        # Rounded to 0.1 mm and interpolated; around outlines a pixel may show what is a pixel of the sensor away.
+        assert np.quantile(known_scene.distance_to_surfaces(points, 0.0), 0.95) < 2e-4
+        assert len(points) > 0.9 * depth[view].size
+    assert_valid(imported)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"depth_to_color": None}, "depth_to_color"),
+        ({"depth_to_color": [[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1]]}, "scaled by 2"),
+        ({"depth_to_colour": 1}, "unknown key 'depth_to_colour'; did you mean 'depth_to_color'"),
+        ({"K": [[1, 0], [0, 1]]}, r"depth_camera: 'K' has shape \(2, 2\)"),
+        ({"pixel_center": 0.25}, "pixel_center"),
+    ],
+)
+def test_mistakes_in_a_depth_camera_are_named(tmp_path: Path, changes: dict, message: str):
+    source = write_plain(tmp_path / "take")
+    _with_sensor(source, **changes)
+    with pytest.raises(DataError, match=message):
+        import_recordings(source, tmp_path / "out", {})

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
+from data_gen.importers.image_geometry import ImageGeometry
 from data_gen.importers.ros_bag import matches, recordings
 from data_gen.importers.settings import ImportSettings
 from tests.data_gen.importers.known_scene import render
@@ -74,7 +75,7 @@ def test_recovers_cameras_colours_and_points(tmp_path, pictures, kind, encoding,
     assert recording.source["axes"] == "opencv"
     assert recording.source["depth_type"] == "z"
     assert recording.source["pixel_center"] == "0.0"
-    assert recording.source["cameras"] == RGB
+    assert recording.view_names == [RGB]
     assert recording.distortion is None
     np.testing.assert_array_equal(recording.read_rgb(0, 0), pictures[0].rgb)  # back to the start
 
@@ -303,3 +304,25 @@ def test_validate_names_a_mistaken_convention(tmp_path, pictures, mistake, sugge
     report = import_and_validate(path, tmp_path / "out", mapping=mapping, **mistake)
     assert not report.is_valid
     assert suggestion in str(report.faults[0])
+
+
+def test_depth_of_another_sensor_is_registered_where_the_bag_says_where_it_is(tmp_path, pictures):
+    to_color = np.eye(4)
+    to_color[:3, 3] = [0.03, 0.005, 0.0]
+    frame = "camera_depth_optical_frame"
+    seen = [render(INTRINSICS, pose(time) @ to_color, HEIGHT, WIDTH, time) for time in TIMES]
+    with BagWriter(tmp_path, "ros2") as bag:
+        write_transforms(bag)
+        bag.transform("/tf_static", START, OPTICAL, frame, to_color)
+        for stamp, picture, other in zip(STAMPS, pictures, seen, strict=True):
+            bag.image(RGB, stamp, OPTICAL, "rgb8", picture.rgb)
+            bag.image("/camera/depth/image_rect_raw", stamp, frame, "16UC1", millimetres(other))
+            bag.info(INFO, stamp, OPTICAL)
+            bag.info("/camera/depth/camera_info", stamp, frame)
+    (recording,) = recordings(bag.path, ImportSettings())
+    (sensor,) = recording.depth_cameras
+    np.testing.assert_allclose(sensor.to_color, to_color, atol=1e-9)
+    registered = ImageGeometry(recording, ImportSettings()).depth(2, 0)
+    error = np.abs(registered - pictures[2].depth)[registered > 0]
+    assert np.quantile(error, 0.9) < 0.002  # millimetres, and planes between them
+    assert (registered > 0).mean() > 0.9

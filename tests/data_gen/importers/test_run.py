@@ -13,7 +13,8 @@ from data_gen import dataset_folder
 from data_gen.importers import run
 from data_gen.importers.formats import FORMATS, open_format
 from data_gen.importers.run import import_recordings
-from data_gen.importers.settings import load_import_settings
+from data_gen.importers.scene_bounds import SampledPoints, scene_bounds
+from data_gen.importers.settings import ImportSettings, load_import_settings
 from tests.data_gen.importers import known_scene
 from tests.data_gen.importers.checks import TOLERANCE, assert_valid, attributes, camera_errors, files, worst_point
 from tests.data_gen.importers.plain_recording import HEIGHT, WIDTH, write_plain
@@ -194,8 +195,12 @@ def test_bounds_are_estimated_and_said(
             seen = known_scene.unproject(depth[view], intrinsics[0, view], np.eye(4))
             distances.append(np.linalg.norm(seen, axis=1))
             points.append(seen @ poses[0, view, :3, :3].T + poses[0, view, :3, 3])
-    inside = ((np.concatenate(points) > low) & (np.concatenate(points) < high)).all(axis=1)
-    assert 0.9 < inside.mean() < 1.0
+    joined = np.concatenate(points)
+    inside = ((joined > low) & (joined < high)).all(axis=1)
+    assert inside[joined[:, 2] > 0.05].mean() > 0.98  # the box
+    far_floor = np.abs(joined[:, :2]).max(axis=1) > 1.5
+    assert far_floor.sum() > 50
+    assert not inside[far_floor].any()
     assert (np.concatenate(distances)[inside] > near).mean() > 0.999
     assert (np.concatenate(distances)[inside] < far).all()
     box = known_scene.box_pose(0.0)[:3, 3]
@@ -209,6 +214,27 @@ def test_bounds_are_estimated_and_said(
     assert "estimated from" not in capsys.readouterr().out
     with pytest.raises(DataError, match="(?s)No measured point lies in the workspace.*The points reach from"):
         import_recordings(source, tmp_path / "far", {"workspace_min": [50, 50, 50], "workspace_max": [51, 51, 51]})
+
+
+def test_a_ground_with_nothing_on_it_and_a_tilted_one_count_as_a_whole():
+    rng = np.random.default_rng(0)
+    floor = np.stack([rng.uniform(-3, 3, 9000), rng.uniform(-2, 2, 9000), rng.normal(0, 0.002, 9000)], axis=1)
+    box = rng.uniform([0.1, 0.2, 0.0], [0.4, 0.5, 0.3], (900, 3))
+    tilted = floor + np.stack([np.zeros(9000), np.zeros(9000), 0.3 * floor[:, 0]], axis=1)
+
+    def bounds(positions: np.ndarray):
+        points = SampledPoints(positions, np.full(len(positions), 2.0))
+        return scene_bounds(points, np.zeros(3), ImportSettings())
+
+    for whole in (floor, np.concatenate([tilted, box])):
+        found = bounds(whole)
+        assert found.ground is None
+        assert found.workspace_min[0] < -2.9
+    cut = bounds(np.concatenate([floor, box]))
+    assert cut.ground == pytest.approx(0.0, abs=1e-3)
+    assert -0.35 < cut.workspace_min[0] < -0.15  # 0.3 m of room, and 5 %
+    assert 0.7 < cut.workspace_max[0] < 0.85
+    assert cut.workspace_max[2] == pytest.approx(0.3, abs=0.1)
 
 
 def test_stray_measurements_do_not_stretch_the_workspace(source: Path, imported: Path, tmp_path: Path):

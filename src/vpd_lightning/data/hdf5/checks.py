@@ -6,6 +6,7 @@ kilobytes to many gigabytes.
 """
 
 import errno
+import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,12 +19,14 @@ import numpy as np
 from vpd_lightning.data.busy import busy_error
 from vpd_lightning.data.hdf5.broken_file import BrokenFileError, brief, refuse
 from vpd_lightning.data.hdf5.text_heaps import global_heaps_valid
+from vpd_lightning.data.schema import VIEW_NAMES
 from vpd_lightning.errors import DataError
 
 MAX_DATASET_BYTES = 64 * 2**30
 MAX_CHUNK_BYTES = 256 * 2**20
 MAX_ATTRIBUTE_BYTES = 64 * 2**10
 MAX_LINKS = 64
+_MAX_NAME = 80  # characters shown of a view's name
 # Pictures of one colour shrink a thousandfold too; that is allowed up to what any machine can hold.
 MAX_RATIO, MAX_BYTES_AT_ANY_RATIO = 300, 256 * 2**20
 _MAX_DEPTH = 4  # of groups in groups
@@ -236,6 +239,20 @@ def checked_attribute(path: Path, owner: h5py.Group | h5py.Dataset, name: str, k
     if length:
         return tuple(float(item) for item in value)
     return int(value) if kind == "integer" else float(value)
+
+
+def checked_view_names(path: Path, file: h5py.File, num_views: int) -> tuple[str, ...]:
+    """Return the names of the views, a JSON list in an attribute; empty where the file has none."""
+    if VIEW_NAMES not in file.attrs:
+        return ()
+    text = checked_attribute(path, file, VIEW_NAMES, "text")
+    try:
+        names = json.loads(text)
+    except (ValueError, RecursionError):
+        names = None
+    if not isinstance(names, list) or len(names) != num_views or not all(isinstance(name, str) for name in names):
+        raise refuse(path, "wrong_attribute", f"attribute {VIEW_NAMES!r} is no JSON list of {num_views} names")
+    return tuple(" ".join(name.split())[:_MAX_NAME] for name in names)
 
 
 def read_all(path: Path, dataset: h5py.Dataset, selection: Any = ()) -> np.ndarray:

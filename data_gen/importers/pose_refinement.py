@@ -1,0 +1,180 @@
+"""Poses of cameras that stand still, refined by laying the surfaces that they see onto each other.
+
+Point-to-plane ICP (Chen and Medioni 1992) over all views at once: points of each view are compared with the planes of
+the pixels that show them in every other view, and all motions that make them agree come from one linear system, again
+and again. What no surface determines, as sliding along a bare floor, stays as it was given. The first view stays where
+it is: it carries the world. Points are paired by projection, which knows what a view can see; nearest points, as ICP
+libraries pair them, move views across what only one of them sees (docs/notes.md).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from data_gen.importers.image_geometry import ImageGeometry
+from data_gen.inspection.pose_agreement import SurfaceOffsets, surface_offsets
+from data_gen.inspection.posed_depth import PosedDepth
+from data_gen.inspection.smooth_surface import SmoothSurface, smooth_surface
+from vpd_lightning.errors import ConfigError, DataError
+
+Array = NDArray[np.float64]
+
+_MAX_RECORDINGS = 3  # of one camera arrangement
+_MAX_FRAMES = 7  # of each; the median over them leaves what stands still, with less noise
+_REACHES = (0.06, 0.06, 0.03, 0.03, *(0.015,) * 4, *(0.0075,) * 12)  # of the depth: offsets up to there count
+_TELLING = 8.0  # points that face a motion, or as many more that it passes at an angle, for it to be determined
+_SURE = 3.0  # standard errors that a step must have
+_MAX_SHIFT, _MAX_TURN = 0.1, 10.0  # of the median depth, and degrees: farther off is no calibration
+
+
+@dataclass(frozen=True)
+class RefinedPoses:
+    """Refined cam_to_world (view, 4, 4) by the name of each recording, and what to tell the user."""
+
+    poses: Mapping[str, Array]
+    remarks: Sequence[str]
+
+
+@dataclass(frozen=True)
+class _Scenery:
+    """What stands still before all cameras during one recording; poses are the camera's own (identity)."""
+
+    images: Sequence[PosedDepth]
+    surfaces: Sequence[SmoothSurface]
+
+
+def refine_poses(geometries: Mapping[str, ImageGeometry], every: int) -> RefinedPoses:
+    """Refine the poses of all recordings; those with the same cameras in the same places are refined together.
+
+    Raises:
+        ConfigError: there is one view, or cameras move.
+        DataError: a pose is too far off to be refined.
+    """
+    arrangements: dict[bytes, list[str]] = {}
+    for name, geometry in geometries.items():
+        recording = geometry.recording
+        if recording.num_views < 2 or recording.cam_to_world.ndim == 4 or recording.intrinsics.ndim == 4:
+            fault = "has one view" if recording.num_views < 2 else "has cameras that move"
+            raise ConfigError(
+                f"refine_poses=true compares what several fixed cameras see, but {name} {fault}.\nRemove refine_poses."
+            )
+        key = recording.cam_to_world.tobytes() + geometry.intrinsics().tobytes()
+        arrangements.setdefault(key, []).append(name)
+    poses: dict[str, Array] = {}
+    remarks = []
+    for names in arrangements.values():
+        chosen = names[:: max(1, -(-len(names) // _MAX_RECORDINGS))]
+        refined, lines = _refine([geometries[name] for name in chosen], every)
+        poses.update(dict.fromkeys(names, refined))
+        others = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        remarks += [f"refined poses of {names[0]}{others}:", *(f"  {line}" for line in lines)]
+    return RefinedPoses(poses, remarks)
+
+
+def _refine(geometries: Sequence[ImageGeometry], every: int) -> tuple[Array, list[str]]:
+    """Return poses (view, 4, 4) and lines for a person."""
+    first = geometries[0].recording
+    sceneries = [_scenery(geometry, every) for geometry in geometries]
+    given, poses = first.cam_to_world, first.cam_to_world.copy()
+    is_told = np.zeros(first.num_views, bool)
+    for reach in _REACHES:
+        motions, is_told, num_kept = _motions(sceneries, poses, reach)
+        poses = motions @ poses
+    before, after = (_median_distance(sceneries, each) for each in (given, poses))
+    lines = []
+    depths = np.concatenate([image.depth[image.depth > 0] for scenery in sceneries for image in scenery.images])
+    for view in range(1, first.num_views):
+        label = f"view {view}" + (f" ({first.view_names[view]})" if first.view_names else "")
+        if not is_told[view]:
+            lines.append(f"{label}: shares no surface with the others, and stays as it was given")
+            continue
+        moved = float(np.linalg.norm(poses[view, :3, 3] - given[view, :3, 3]))
+        turn = np.degrees(Rotation.from_matrix(poses[view, :3, :3] @ given[view, :3, :3].T).magnitude())
+        if moved > _MAX_SHIFT * np.median(depths) or turn > _MAX_TURN:
+            raise DataError(
+                f"{label}: the pose that fits the surfaces is {100 * moved:.1f} cm and {turn:.1f} degrees from the one "
+                "given, too far for a refinement.\nCalibrate the cameras again, or import without refine_poses and let "
+                "vpd-data validate say which convention is wrong."
+            )
+        lines.append(f"{label}: moved by {1000 * moved:.1f} mm, turned by {turn:.2f} degrees")
+    if num_kept:
+        lines.append(
+            f"no surface determines {num_kept} of the {6 * (first.num_views - 1)} parts of these motions: kept"
+        )
+    if np.isfinite(after):
+        lines.append(f"what two views see lies {1000 * after:.1f} mm apart (median); before, {1000 * before:.1f} mm")
+    return poses, lines
+
+
+def _scenery(geometry: ImageGeometry, every: int) -> _Scenery:
+    """Take the median over frames of each view's depth, where most of them have one."""
+    recording, images = geometry.recording, []
+    frames = range(0, recording.num_frames, every)
+    times = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _MAX_FRAMES)).round().astype(int))
+    for view in range(recording.num_views):
+        depth = np.stack([geometry.depth(frames[time], view) for time in times])
+        is_measured = depth > 0
+        is_mostly = is_measured.sum(axis=0) > len(times) / 2
+        median = np.nanmedian(np.where(is_measured | ~is_mostly, depth, np.nan), axis=0)
+        still = np.where(is_mostly, median, 0).astype(np.float32)
+        images.append(PosedDepth(still, geometry.intrinsics()[view], np.eye(4)))
+    return _Scenery(images, [smooth_surface(image) for image in images])
+
+
+def _offsets(sceneries: Sequence[_Scenery], poses: Array) -> Iterator[tuple[int, int, SurfaceOffsets]]:
+    """Yield what the points of one view miss another's surfaces by, for all pairs of views of all recordings."""
+    for scenery in sceneries:
+        placed = [replace(image, cam_to_world=pose) for image, pose in zip(scenery.images, poses, strict=True)]
+        for one, other in permutations(range(len(placed)), 2):
+            surfaces = scenery.surfaces[one], scenery.surfaces[other]
+            yield one, other, surface_offsets(placed[one], surfaces[0], placed[other], surfaces[1], spacing=1)
+
+
+def _motions(sceneries: Sequence[_Scenery], poses: Array, reach: float) -> tuple[Array, NDArray[np.bool_], int]:
+    """Return one step of ICP: a rigid motion for each view (view, 4, 4), which of them take part, and the parts kept.
+
+    ``reach`` is the share of depth up to which offsets count.
+    """
+    num_views = len(poses)
+    found = list(_offsets(sceneries, poses))
+    points = np.concatenate([offsets.points for _, _, offsets in found])
+    if not len(points):
+        return np.broadcast_to(np.eye(4), (num_views, 4, 4)), np.zeros(num_views, bool), 0
+    center = np.median(points, axis=0)
+    radius = float(np.median(np.linalg.norm(points - center, axis=1)))  # a turn counts by how far it moves this point
+    information, wanted = np.zeros((num_views, 6, num_views, 6)), np.zeros((num_views, 6))
+    scatter = 1.4826 * np.median(np.concatenate([np.abs(offsets.distances) for _, _, offsets in found]))
+    for one, other, offsets in found:
+        near = np.abs(offsets.distances) <= reach * offsets.depth
+        normals = offsets.normals[near]
+        arms = np.cross((offsets.points[near] - center) / radius, normals)
+        parts = np.concatenate([normals, arms], axis=1)  # of a motion of the points; of the surface, the negative
+        square, pull = parts.T @ parts, parts.T @ offsets.distances[near]
+        for view, sign in ((one, 1), (other, -1)):
+            wanted[view] += sign * pull
+            information[view, :, view] += square
+        information[one, :, other] -= square
+        information[other, :, one] -= square
+    size = 6 * (num_views - 1)  # the first view stays
+    values, axes = np.linalg.eigh(information[1:, :, 1:].reshape(size, size))
+    is_known = values > _TELLING
+    asked = axes.T @ wanted[1:].ravel()
+    # Noise tilts normals, so that a floor asks for a slide, which makes nothing agree better and is asked for again.
+    is_sure = is_known & (np.abs(asked) > _SURE * scatter * np.sqrt(np.maximum(values, 0)))
+    solution = axes[:, is_sure] @ (asked[is_sure] / values[is_sure])
+    motions = np.tile(np.eye(4), (num_views, 1, 1))
+    for view, part in enumerate(solution.reshape(-1, 6), 1):
+        motions[view, :3, :3] = Rotation.from_rotvec(part[3:] / radius).as_matrix()
+        motions[view, :3, 3] = center + part[:3] - motions[view, :3, :3] @ center
+    own = np.array([np.trace(information[view, :, view]) for view in range(num_views)])
+    return motions, own > _TELLING, int((~is_known).sum())
+
+
+def _median_distance(sceneries: Sequence[_Scenery], poses: Array) -> float:
+    """Return how far points lie from the surfaces of other views, metres; NaN where no view sees another's."""
+    distances = np.concatenate([np.abs(offsets.distances) for _, _, offsets in _offsets(sceneries, poses)])
+    return float(np.median(distances)) if len(distances) else float("nan")
