@@ -13,6 +13,7 @@ from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
 
 from data_gen.importers.image_geometry import ImageGeometry
@@ -26,9 +27,14 @@ Array = NDArray[np.float64]
 _MAX_RECORDINGS = 3  # of one camera arrangement
 _MAX_FRAMES = 7  # of each; the median over them leaves what stands still, with less noise
 _REACHES = (0.06, 0.06, 0.03, 0.03, *(0.015,) * 4, *(0.0075,) * 12)  # of the depth: offsets up to there count
-_TELLING = 8.0  # points that face a motion, or as many more that it passes at an angle, for it to be determined
+_TOLD = 8.0  # points that face a motion, or as many more that it passes at an angle, for it to be determined
+_TILTED = 10.0  # times what noise would feign: it tilts the normals of a floor, which then seems to determine a slide
+_NORMALS = 9  # pixels across which normals are compared, to find out how far noise tilts them
+_BETTER = 0.99  # of the disagreement before; where refined poses leave more, those given are kept
 _SURE = 3.0  # standard errors that a step must have
-_MAX_SHIFT, _MAX_TURN = 0.1, 10.0  # of the median depth, and degrees: farther off is no calibration
+_SHARED = 0.03  # of a picture's pixels: two views that share fewer are not compared
+_FAR = 2.0  # times the median depth: beyond it a pixel is too coarse to tell anything
+_MAX_SHIFT, _MAX_TURN = 0.05, 5.0  # of the median depth, and degrees: farther off is no calibration
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,20 @@ class _Scenery:
 
     images: Sequence[PosedDepth]
     surfaces: Sequence[SmoothSurface]
+
+    @property
+    def tilt(self) -> float:
+        """Variance of normals on smooth surfaces, in each direction."""
+        return float(np.median(np.concatenate([_tilt(surface) for surface in self.surfaces])))
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Poses (view, 4, 4), which views share surfaces with others (view,), and how many parts of motions were kept."""
+
+    poses: Array
+    is_seen: NDArray[np.bool_]
+    num_kept: int
 
 
 def refine_poses(geometries: Mapping[str, ImageGeometry], every: int) -> RefinedPoses:
@@ -79,18 +99,20 @@ def _refine(geometries: Sequence[ImageGeometry], every: int) -> tuple[Array, lis
     """Return poses (view, 4, 4) and lines for a person."""
     first = geometries[0].recording
     sceneries = [_scenery(geometry, every) for geometry in geometries]
-    given, poses = first.cam_to_world, first.cam_to_world.copy()
-    is_told = np.zeros(first.num_views, bool)
+    given = first.cam_to_world
+    step = _Step(given, np.zeros(first.num_views, bool), 0)
     for reach in _REACHES:
-        motions, is_told, num_kept = _motions(sceneries, poses, reach)
-        poses = motions @ poses
+        step = _next(sceneries, step.poses, reach)
+    if not _disagreement(sceneries, step.poses) < _BETTER * _disagreement(sceneries, given):
+        step = replace(step, poses=given)
+    poses = step.poses
     before, after = (_median_distance(sceneries, each) for each in (given, poses))
     lines = []
     depths = np.concatenate([image.depth[image.depth > 0] for scenery in sceneries for image in scenery.images])
     for view in range(1, first.num_views):
         label = f"view {view}" + (f" ({first.view_names[view]})" if first.view_names else "")
-        if not is_told[view]:
-            lines.append(f"{label}: shares no surface with the others, and stays as it was given")
+        if not step.is_seen[view]:
+            lines.append(f"{label}: shares too little with the others, and stays as it was given")
             continue
         moved = float(np.linalg.norm(poses[view, :3, 3] - given[view, :3, 3]))
         turn = np.degrees(Rotation.from_matrix(poses[view, :3, :3] @ given[view, :3, :3].T).magnitude())
@@ -101,10 +123,9 @@ def _refine(geometries: Sequence[ImageGeometry], every: int) -> tuple[Array, lis
                 "vpd-data validate say which convention is wrong."
             )
         lines.append(f"{label}: moved by {1000 * moved:.1f} mm, turned by {turn:.2f} degrees")
-    if num_kept:
-        lines.append(
-            f"no surface determines {num_kept} of the {6 * (first.num_views - 1)} parts of these motions: kept"
-        )
+    if step.num_kept:
+        parts = 6 * (first.num_views - 1)
+        lines.append(f"the surfaces do not determine {step.num_kept} of the {parts} parts of these motions: kept")
     if np.isfinite(after):
         lines.append(f"what two views see lies {1000 * after:.1f} mm apart (median); before, {1000 * before:.1f} mm")
     return poses, lines
@@ -120,30 +141,38 @@ def _scenery(geometry: ImageGeometry, every: int) -> _Scenery:
         is_measured = depth > 0
         is_mostly = is_measured.sum(axis=0) > len(times) / 2
         median = np.nanmedian(np.where(is_measured | ~is_mostly, depth, np.nan), axis=0)
-        still = np.where(is_mostly, median, 0).astype(np.float32)
+        is_near = is_mostly & (median <= _FAR * np.median(median[is_mostly])) if is_mostly.any() else is_mostly
+        still = np.where(is_near, median, 0).astype(np.float32)
         images.append(PosedDepth(still, geometry.intrinsics()[view], np.eye(4)))
     return _Scenery(images, [smooth_surface(image) for image in images])
 
 
+def _tilt(surface: SmoothSurface) -> Array:
+    """Return the variance (pixel,) of normals around each sure pixel, in each direction."""
+    weights = surface.is_sure.astype(np.float64)
+    share = np.maximum(uniform_filter(weights, _NORMALS), 1e-9)
+    mean = np.stack([uniform_filter(surface.normals[..., i] * weights, _NORMALS) / share for i in range(3)], axis=-1)
+    return (0.5 * (1 - (mean**2).sum(axis=-1)))[surface.is_sure]
+
+
 def _offsets(sceneries: Sequence[_Scenery], poses: Array) -> Iterator[tuple[int, int, SurfaceOffsets]]:
-    """Yield what the points of one view miss another's surfaces by, for all pairs of views of all recordings."""
+    """Yield what the points of one view miss another's surfaces by, for pairs of views that share enough of them."""
     for scenery in sceneries:
         placed = [replace(image, cam_to_world=pose) for image, pose in zip(scenery.images, poses, strict=True)]
         for one, other in permutations(range(len(placed)), 2):
             surfaces = scenery.surfaces[one], scenery.surfaces[other]
-            yield one, other, surface_offsets(placed[one], surfaces[0], placed[other], surfaces[1], spacing=1)
+            offsets = surface_offsets(placed[one], surfaces[0], placed[other], surfaces[1], spacing=1)
+            if len(offsets.points) >= _SHARED * placed[one].depth.size:
+                yield one, other, offsets
 
 
-def _motions(sceneries: Sequence[_Scenery], poses: Array, reach: float) -> tuple[Array, NDArray[np.bool_], int]:
-    """Return one step of ICP: a rigid motion for each view (view, 4, 4), which of them take part, and the parts kept.
-
-    ``reach`` is the share of depth up to which offsets count.
-    """
+def _next(sceneries: Sequence[_Scenery], poses: Array, reach: float) -> _Step:
+    """Take one step of ICP; ``reach`` is the share of depth up to which offsets count."""
     num_views = len(poses)
     found = list(_offsets(sceneries, poses))
+    if not found:
+        return _Step(poses, np.zeros(num_views, bool), 6 * (num_views - 1))
     points = np.concatenate([offsets.points for _, _, offsets in found])
-    if not len(points):
-        return np.broadcast_to(np.eye(4), (num_views, 4, 4)), np.zeros(num_views, bool), 0
     center = np.median(points, axis=0)
     radius = float(np.median(np.linalg.norm(points - center, axis=1)))  # a turn counts by how far it moves this point
     information, wanted = np.zeros((num_views, 6, num_views, 6)), np.zeros((num_views, 6))
@@ -161,9 +190,9 @@ def _motions(sceneries: Sequence[_Scenery], poses: Array, reach: float) -> tuple
         information[other, :, one] -= square
     size = 6 * (num_views - 1)  # the first view stays
     values, axes = np.linalg.eigh(information[1:, :, 1:].reshape(size, size))
-    is_known = values > _TELLING
+    tilt = np.median([scenery.tilt for scenery in sceneries])
+    is_known = values > _TOLD + _TILTED * tilt * len(points)
     asked = axes.T @ wanted[1:].ravel()
-    # Noise tilts normals, so that a floor asks for a slide, which makes nothing agree better and is asked for again.
     is_sure = is_known & (np.abs(asked) > _SURE * scatter * np.sqrt(np.maximum(values, 0)))
     solution = axes[:, is_sure] @ (asked[is_sure] / values[is_sure])
     motions = np.tile(np.eye(4), (num_views, 1, 1))
@@ -171,10 +200,16 @@ def _motions(sceneries: Sequence[_Scenery], poses: Array, reach: float) -> tuple
         motions[view, :3, :3] = Rotation.from_rotvec(part[3:] / radius).as_matrix()
         motions[view, :3, 3] = center + part[:3] - motions[view, :3, :3] @ center
     own = np.array([np.trace(information[view, :, view]) for view in range(num_views)])
-    return motions, own > _TELLING, int((~is_known).sum())
+    return _Step(motions @ poses, own > _TOLD, int((~is_known).sum()))
+
+
+def _disagreement(sceneries: Sequence[_Scenery], poses: Array) -> float:
+    """Return the mean square of offsets as shares of depth; beyond the last reach they count as much as there."""
+    shares = [offsets.distances / offsets.depth for _, _, offsets in _offsets(sceneries, poses)]
+    return float((np.minimum(np.abs(np.concatenate(shares)), _REACHES[-1]) ** 2).mean()) if shares else 0.0
 
 
 def _median_distance(sceneries: Sequence[_Scenery], poses: Array) -> float:
     """Return how far points lie from the surfaces of other views, metres; NaN where no view sees another's."""
-    distances = np.concatenate([np.abs(offsets.distances) for _, _, offsets in _offsets(sceneries, poses)])
-    return float(np.median(distances)) if len(distances) else float("nan")
+    distances = [np.abs(offsets.distances) for _, _, offsets in _offsets(sceneries, poses)]
+    return float(np.median(np.concatenate(distances))) if distances else float("nan")

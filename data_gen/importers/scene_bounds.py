@@ -143,6 +143,7 @@ def _without_far_ground(
     room = max(_ROOM * float((high - low).max()), _LEAST_ROOM * distance)
     cut_lower, cut_upper = lower.copy(), upper.copy()
     cut_lower[:2], cut_upper[:2] = np.maximum(lower[:2], low - room), np.minimum(upper[:2], high + room)
+    cut_upper[2] = max(upper[2], float(np.quantile(standing[:, 2], 1 - _OUTLIERS)))  # few points, but all of a pole
     if np.array_equal(cut_lower, lower) and np.array_equal(cut_upper, upper):
         return lower, upper, None
     return cut_lower, cut_upper, level

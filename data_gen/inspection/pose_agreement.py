@@ -158,7 +158,6 @@ def surface_offsets(
     offset = direction * other.depth[row, column].astype(np.float64)[:, None] - seen
     distance = (offset * facing).sum(axis=1)
     alike = (facing @ other.cam_to_world[:3, :3].T * normals).sum(axis=1)
-    sign = np.where(alike < 0, -1.0, 1.0)
     near = np.abs(other.depth[row, column] - seen[:, 2]) <= _REACH * seen[:, 2]
-    kept = in_image & other_surface.is_sure[row, column] & near & (np.abs(alike) > 0.9)
-    return SurfaceOffsets(points[kept], normals[kept], (sign * distance)[kept], depth[kept])
+    kept = in_image & other_surface.is_sure[row, column] & near & (alike > 0.9)  # not the other side of a thin body
+    return SurfaceOffsets(points[kept], normals[kept], distance[kept], depth[kept])

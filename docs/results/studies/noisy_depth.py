@@ -1,0 +1,100 @@
+"""``model=inertial`` trained and evaluated on what depth cameras deliver, beside clean depth.
+
+``python -m docs.results.studies.noisy_depth OUT.json WORK [--seeds 0,1] [--conditions NAME,...]``. For every scene and
+condition the small data set is generated with a sensor (``WORK/SCENE_CONDITION``), a model is trained on it by
+``budget=minutes``, and its last checkpoint is evaluated on the test clips of the same data set: it sees their noisy
+depth, and is judged by their true state and their pictures. What is there already is not made again. Percentages are of
+the scene's median depth; cameras are triggered together unless the condition says otherwise.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from vpd_lightning.files import AtomicPath
+
+SCENES = ("mujoco_block", "deformable_collision", "movi_a")
+CONDITIONS: dict[str, tuple[str, ...]] = {
+    "clean": (),
+    "structured_light_0.2": ("sensor=structured_light", "sensor.percent_at_median=0.2"),
+    "active_stereo_0.5": ("sensor=active_stereo", "sensor.percent_at_median=0.5"),
+    "trigger_15ms": ("sensor=structured_light", "sensor.percent_at_median=0.2", "sensor.trigger_offset=0.015"),
+    "poses_5mm": ("sensor=structured_light", "sensor.percent_at_median=0.2", "sensor.pose_offset=0.005"),
+}
+STEPS = (1, 4, 8, 16, 32)
+
+
+def figures(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what one ``metrics.json`` says of moving pixels (decibels) and of centroids (centimetres), by horizon."""
+
+    def at(summary: Mapping[str, Any], scale: float = 1.0) -> dict[str, float | None]:
+        values = {step: summary["per_step"][step - 1] for step in STEPS if step <= len(summary["per_step"])}
+        return {str(step): None if value is None else scale * value for step, value in values.items()}
+
+    motion = metrics["motion"]
+    return {
+        "updates": metrics["step"],
+        "minutes": metrics["training"].get("cpu_minutes"),
+        "num_clips": metrics["protocol"]["num_clips"],
+        "psnr_moving": metrics["psnr_moving"]["mean"],
+        "psnr_moving_references": {name: value["psnr_moving"]["mean"] for name, value in metrics["references"].items()},
+        "psnr": metrics["psnr"]["mean"],
+        "ssim": metrics["ssim"]["mean"],
+        "centroid_error": at(motion["centroid_error"], 100),
+        "nothing_moves": at(motion["centroid_error_copy"], 100),
+        "best_constant": at(motion["centroid_error_constant"], 100),
+        "constant_velocity": at(motion["centroid_error_velocity"], 100),
+    }
+
+
+def measured(scene: str, condition: str, seed: int, work: Path) -> dict[str, Any]:
+    """Generate, train and evaluate, as far as that is not done, and return the figures."""
+    data, run = work / f"{scene}_{condition}", work / "runs" / f"{scene}_{condition}_seed{seed}"
+    if not (run / "evaluation" / "metrics.json").is_file():
+        _call("data", "generate", f"scene={scene}", "preset=small", "seed=0", f"out={data}", *CONDITIONS[condition])
+        words = (f"experiment={scene}", "model=inertial", "budget=minutes", f"seed={seed}", f"data.folder={data}")
+        _call("train", *words, f"run.folder={run}", "evaluate=false", "resume=auto")
+        where = (f"ckpt={run}", f"data.folder={data}", f"out={run / 'evaluation'}")
+        _call("eval", *where, "num_videos=0", "num_threads=1", "protocol.start_frames=[0]")
+    return figures(json.loads((run / "evaluation" / "metrics.json").read_text()))
+
+
+def _call(command: str, *words: str) -> None:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run([sys.executable, "-m", f"vpd_lightning.commands.{command}", *words], check=True, env=environment)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure what is missing and write the figures after every model."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--scenes", type=lambda text: text.split(","), default=list(SCENES))
+    parser.add_argument("--seeds", type=lambda text: [int(word) for word in text.split(",")], default=[0, 1])
+    parser.add_argument("--conditions", type=lambda text: text.split(","), default=list(CONDITIONS)[:3])
+    options = parser.parse_args(arguments)
+    cells = json.loads(options.out.read_text())["cells"] if options.out.is_file() else {}
+    for seed in options.seeds:
+        for scene in options.scenes:
+            for condition in options.conditions:
+                key = f"{scene}/{condition}/seed{seed}"
+                if key in cells:
+                    continue
+                cells[key] = measured(scene, condition, seed, options.work)
+                with AtomicPath(options.out) as part:
+                    result = {
+                        "command": "python -m docs.results.studies.noisy_depth",
+                        "cells": dict(sorted(cells.items())),
+                    }
+                    part.write_text(json.dumps(result, indent=1) + "\n")
+                print(key, json.dumps(cells[key]), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
