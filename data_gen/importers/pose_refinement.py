@@ -28,13 +28,14 @@ _MAX_RECORDINGS = 3  # of one camera arrangement
 _MAX_FRAMES = 7  # of each; the median over them leaves what stands still, with less noise
 _REACHES = (0.06, 0.06, 0.03, 0.03, *(0.015,) * 4, *(0.0075,) * 12)  # of the depth: offsets up to there count
 _TOLD = 8.0  # points that face a motion, or as many more that it passes at an angle, for it to be determined
-_TILTED = 10.0  # times what noise would feign: it tilts the normals of a floor, which then seems to determine a slide
+_TILTED = 3.0  # times what noise would feign: it tilts the normals of a floor, which then seems to determine a slide
 _NORMALS = 9  # pixels across which normals are compared, to find out how far noise tilts them
 _BETTER = 0.99  # of the disagreement before; where refined poses leave more, those given are kept
 _SURE = 3.0  # standard errors that a step must have
 _SHARED = 0.03  # of a picture's pixels: two views that share fewer are not compared
 _FAR = 2.0  # times the median depth: beyond it a pixel is too coarse to tell anything
-_MAX_SHIFT, _MAX_TURN = 0.05, 5.0  # of the median depth, and degrees: farther off is no calibration
+_MAX_SHIFT, _MAX_TURN = 0.1, 10.0  # of the median depth, and degrees: farther off is no calibration
+_FAR_SHIFT = 0.03  # of the median depth; what was moved farther is pointed out
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,9 @@ def _refine(geometries: Sequence[ImageGeometry], every: int) -> tuple[Array, lis
                 "given, too far for a refinement.\nCalibrate the cameras again, or import without refine_poses and let "
                 "vpd-data validate say which convention is wrong."
             )
-        lines.append(f"{label}: moved by {1000 * moved:.1f} mm, turned by {turn:.2f} degrees")
+        far = moved > _FAR_SHIFT * np.median(depths)
+        doubt = "; far for a refinement: look at points.png of vpd-data inspect" if far else ""
+        lines.append(f"{label}: moved by {1000 * moved:.1f} mm, turned by {turn:.2f} degrees{doubt}")
     if step.num_kept:
         parts = 6 * (first.num_views - 1)
         lines.append(f"the surfaces do not determine {step.num_kept} of the {parts} parts of these motions: kept")
