@@ -39,3 +39,26 @@ def test_an_exhibition_begins_again_where_nobody_touches_it(tmp_path: Path) -> N
             assert panel.screen.mode == FILM and panel.session.now is viewer.opened.rollout
     finally:
         viewer.stop()
+
+
+def test_what_goes_wrong_once_does_not_end_the_exhibition(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = Viewer(0, TOKEN, kiosk=0.2)
+    try:
+        viewer.show(open_tossed_box(tmp_path), tmp_path / "view", 3)
+        with socket_of(viewer, f"?token={TOKEN}") as connection:
+            connection.send(camera_message())
+            drain(connection)
+            panel = settled_panel(viewer, set())
+            start_over, failed = panel.start_over, []
+
+            def fail_once() -> None:
+                if not failed:
+                    failed.append(True)
+                    raise RuntimeError("the page was redrawn meanwhile")
+                start_over()
+
+            monkeypatch.setattr(panel, "start_over", fail_once)
+            panel.act(lambda: panel.set_mode(PARTICLES))
+            wait_until(lambda: failed and panel.is_untouched)
+    finally:
+        viewer.stop()

@@ -5,7 +5,8 @@
 but the first are shifted and turned by ``SHIFT`` and ``TURN`` (standard deviations along and about each axis), and the
 errors of a sensor are added to their depth. Figures say by how much a camera's points lie in the wrong place, root mean
 square, in percent of the scene's median depth: the median over cameras, and the worst. ``nearest`` is ICP by
-nearest points (``small_gicp``, generalised ICP), each camera against the first; it is measured where that is installed.
+nearest points (``small_gicp``, generalised ICP), each camera against the first; it is measured with ``--nearest``, where
+that is installed.
 """
 
 import argparse
@@ -37,7 +38,7 @@ NUM_VIEWS, NUM_FRAMES = 4, 7
 SHIFT, TURN = 0.005, 0.3  # share of the median depth, degrees
 
 
-def measure(paths: Sequence[Path], sensor_name: str) -> dict[str, Any]:
+def measure(paths: Sequence[Path], sensor_name: str, with_nearest: bool) -> dict[str, Any]:
     """Return the errors of all misplaced cameras of some trajectories, before and after."""
     found: dict[str, list[float]] = {}
     num_refused = 0
@@ -69,7 +70,8 @@ def measure(paths: Sequence[Path], sensor_name: str) -> dict[str, Any]:
             num_refused += 1
             refined = given
         found.setdefault("seconds", []).append(time.process_time() - started)
-        for name, each in {"given": given, "refined": refined, "nearest": _nearest(seen, intrinsics, given)}.items():
+        nearest = _nearest(seen, intrinsics, given) if with_nearest else None
+        for name, each in {"given": given, "refined": refined, "nearest": nearest}.items():
             if each is None:
                 continue
             off = [_misplaced(true_depth[0, v], intrinsics[v], each[v], poses[v], 2 * depth) for v in views[1:]]
@@ -125,6 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--nearest", action="store_true", help="measure nearest points, too; takes minutes a cell")
     options = parser.parse_args(arguments)
     cells: dict[str, Any] = {}
     for scene in SCENES:
@@ -133,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{folder} is not there: left out")
             continue
         for sensor in SENSORS:
-            cells[f"{scene}/{sensor}"] = measure(load_manifest(folder).splits["test"], sensor)
+            cells[f"{scene}/{sensor}"] = measure(load_manifest(folder).splits["test"], sensor, options.nearest)
             print(scene, sensor, json.dumps(cells[f"{scene}/{sensor}"]))
     with AtomicPath(options.out) as part:
         result = {"command": "python -m docs.results.studies.pose_refinement", "cells": cells}

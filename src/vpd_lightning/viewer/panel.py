@@ -117,6 +117,7 @@ class Panel(TabHost):
         """Do what a button asks for; what cannot be done is said in the browser, and nothing else happens."""
         self.touched_at = time.monotonic()
         self._attempt(action)
+        self.touched_at = time.monotonic()  # what took long has only just been done
 
     def _attempt(self, action: Callable[[], Any]) -> None:
         try:
@@ -208,6 +209,11 @@ class Panel(TabHost):
         self.view_tab.mode.value = self.screen.mode = FILM
         self.look_through(self.screen.view)
         self.edited()
+
+    def start_over_if_left(self, seconds: float) -> None:
+        """Begin again where nobody has touched the page for so long."""
+        if time.monotonic() - self.touched_at > seconds and not self.is_untouched:
+            self._attempt(self.start_over)
 
     @property
     def is_untouched(self) -> bool:

@@ -124,5 +124,4 @@ class Viewer:
         assert self._kiosk is not None
         while not self._stopped.wait(min(self._kiosk / 4, 5.0)):
             for panel in list(self.panels.values()):
-                if time.monotonic() - panel.touched_at > self._kiosk and not panel.is_untouched:
-                    panel.start_over()
+                panel.start_over_if_left(self._kiosk)
