@@ -4,7 +4,7 @@ Point-to-plane ICP (Chen and Medioni 1992) over all views at once: points of eac
 the pixels that show them in every other view, and all motions that make them agree come from one linear system, again
 and again. What no surface determines, as sliding along a bare floor, stays as it was given. The first view stays where
 it is: it carries the world. Points are paired by projection, which knows what a view can see; nearest points, as ICP
-libraries pair them, move views across what only one of them sees (docs/notes.md).
+libraries pair them, move views across what only one of them sees.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

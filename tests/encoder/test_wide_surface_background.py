@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from tests.geometry.cast_scenes import FLOOR, TWO_EYES, WALL, Ball, Box, Plane, cast
 from vpd_lightning.encoder.particles.wide_surface_background import WideSurfaceBackground
+from vpd_lightning.geometry.noisy_planes import hangs_alone
 from vpd_lightning.testing.scenes import ball_frames
 
 SETTINGS = {
@@ -238,3 +240,34 @@ def test_there_is_nothing_to_learn_or_to_store():
 def test_wrong_settings_are_refused(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
         background(**changes)
+
+
+def test_noisy_pixels_in_the_air_are_not_trusted_and_those_beside_a_body_do_not_move():
+    frames, shown = cast([FLOOR, Ball((0.1, 0, 0.45), 0.15)])
+    frames = noisy(frames, 0.003)
+    model = background(noise_floor=0.001)
+    clean_mask = model(frames)
+    assert model.trusted(frames, clean_mask).float().mean() > 0.99 * (frames.depth > 0).float().mean()
+    depth = frames.depth.clone()
+    empty = (shown[0, 0] == 0).nonzero()
+    row, column = empty[len(empty) // 3].tolist()
+    depth[0, 0, row, column] *= 0.7  # between the camera and the floor
+    flying = replace(frames, depth=depth)
+    trusted = model.trusted(flying, model(flying) & (shown > 0))
+    assert not trusted[0, 0, row, column]
+    assert trusted.sum() > (depth > 0).sum() * 0.98
+    # A perfect sensor's pixels are all trusted, and so are those of a background that knows nothing of noise.
+    exact, _ = cast([FLOOR, Ball((0.1, 0, 0.45), 0.15)])
+    assert torch.equal(model.trusted(exact, model(exact)), exact.depth > 0)
+    assert torch.equal(background().trusted(flying, model(flying)), depth > 0)
+
+
+def test_points_with_others_near_them_in_any_view_do_not_hang_alone():
+    grid = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0), [0.0], indexing="ij"), axis=-1).reshape(1, 4, 4, 3)
+    points = np.concatenate([grid, grid + [0.5, 0.5, 0.0]])
+    points[0, 1, 1] = [1.0, 1.0, 9.0]
+    valid = np.ones((2, 4, 4), bool)
+    valid[1, 3, 3] = False
+    alone = hangs_alone(points, valid, np.full(valid.shape, 0.5))
+    assert np.argwhere(alone).tolist() == [[0, 1, 1]]
+    assert not hangs_alone(points, np.zeros_like(valid), np.full(valid.shape, 0.5)).any()

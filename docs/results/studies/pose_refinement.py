@@ -3,10 +3,10 @@
 ``python -m docs.results.studies.pose_refinement --root FOLDER --out docs/results/pose_refinement.json``. Data sets
 ``SCENE_240`` in the folder are generated without a sensor, at 240 x 320 pixels. The first four cameras are taken; all
 but the first are shifted and turned by ``SHIFT`` and ``TURN`` (standard deviations along and about each axis), and the
-errors of a sensor are added to their depth. Figures say by how much a camera's points lie in the wrong place, root mean
-square, in percent of the scene's median depth: the median over cameras, and the worst. ``nearest`` is ICP by
-nearest points (``small_gicp``, generalised ICP), each camera against the first; it is measured with ``--nearest``, where
-that is installed.
+errors of a sensor are added to their depth. Figures say by how much a camera's points lie off, root mean square, in
+percent of the scene's median depth: the median over cameras, and the worst. ``nearest`` is ICP by nearest points
+(``small_gicp``, generalised ICP), each camera against the first; it is measured with ``--nearest``, where that is
+installed.
 """
 
 import argparse

@@ -5,8 +5,8 @@
 cameras and one; depth in the depth sensor's own frame) and ``data/`` of github.com/andyzeng/tsdf-fusion-python
 (7-Scenes, a camera that moves through a room). Frame rates are not known of the first two; 0.1 s is assumed. The second
 camera's pose in ``chocapics`` is not given: it is found here from features of both pictures (perspective-n-point with
-RANSAC), to a few centimetres, and is a case for ``refine_poses=true``. The repositories state no licence: use what comes
-out locally.
+RANSAC), to a few centimetres, and is a case for ``refine_poses=true``. The repositories state no licence: use what
+comes out locally.
 """
 
 import argparse

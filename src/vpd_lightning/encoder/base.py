@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
@@ -29,6 +30,12 @@ class AbstractBackground(nn.Module, ABC):
     @abstractmethod
     def forward(self, frames: RGBDFrames) -> Bool[Tensor, "batch view height width"]:
         """Return which pixels may be moving."""
+
+    def trusted(
+        self, frames: RGBDFrames, moving: Bool[Tensor, "batch view height width"]
+    ) -> Bool[Tensor, "batch view height width"]:
+        """Return which pixels measured a surface, given which may move; here all that have a depth."""
+        return torch.isfinite(frames.depth) & (frames.depth > 0)
 
 
 class AbstractEncoder(nn.Module, ABC):

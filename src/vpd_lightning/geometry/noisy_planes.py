@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.ndimage import label
+from scipy.spatial import cKDTree
 
 _STEP = 3
 """Pixels between the three depths that are compared to find noise: neighbours err alike, so nearer ones hide it."""
@@ -39,6 +40,9 @@ _FAR = 1e9  # whose square is a number
 _MIN_ALIKE = 2
 _MAX_STEEPNESS = 4.0
 """Neighbours of its own surface that a pixel of a body has; tangent to the rays up to which they are of its surface."""
+
+_SUPPORT_REACH, _MIN_SUPPORT = 4.0, 4
+"""Widths of a pixel within which a point of a surface has so many others, in any view."""
 
 _NUM_ROUNDS = 8
 _MIN_PIXELS = 5
@@ -126,7 +130,8 @@ def off_wide_planes(
         with np.errstate(invalid="ignore"):
             moving = _without_flying(moving, signed[view] * scatters[view], reach)
         result[view] = _without_specks(moving, np.abs(signed[view]))
-    return result
+    # What lies beside a body in the picture alone, and half a metre off, would drag it along where it meets the floor.
+    return result & ~hangs_alone(views.points, result, views.depth * pixel_sizes[:, None, None])
 
 
 def _wide_planes(views: _Views, noise: NDArray[np.float64], min_width: float) -> list[NDArray[np.float64]]:
@@ -231,6 +236,23 @@ def _by_distance(
                 scatter = float(np.clip(spread, 0.5 * noise, 3 * noise))
             biases[each], scatters[each] = bias, scatter
     return biases, scatters, middles
+
+
+def hangs_alone(
+    points: Float[NDArray[np.floating], "view height width 3"],
+    valid: Bool[NDArray[np.bool_], "view height width"],
+    footprints: Float[NDArray[np.floating], "view height width"],
+) -> Bool[NDArray[np.bool_], "view height width"]:
+    """Return valid pixels that have hardly any others near them in space, points of all views together.
+
+    Between what lies before and behind them in a picture they hang in the air; a body that meets one is thrown off its
+    way. ``footprints`` are the widths of pixels at their depth, metres.
+    """
+    found, alone = points[valid], np.zeros_like(valid)
+    if len(found):
+        counts = cKDTree(found).query_ball_point(found, _SUPPORT_REACH * footprints[valid], return_length=True)
+        alone[valid] = counts <= _MIN_SUPPORT  # itself among them
+    return alone
 
 
 def _settled(deviations: NDArray[np.float64], valid: NDArray[np.bool_]) -> Bool[NDArray[np.bool_], "height width"]:

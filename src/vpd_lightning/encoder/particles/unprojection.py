@@ -115,6 +115,8 @@ class UnprojectingEncoder(AbstractEncoder):
         moving, still, far = None, measured, ~measured
         if self.background is not None:
             dynamic_mask = self.background(_cropped(frames, candidates))
+            trusted = self.background.trusted(frames, dynamic_mask).flatten(1)
+            measured, candidates = measured & trusted, candidates & trusted
             moving, border = (pixels.flatten(1) for pixels in _with_border(dynamic_mask))
             candidates, still = candidates & ~border, measured & ~moving & ~border
             still = _going_on(still.view_as(frames.depth), frames.depth).flatten(1)

@@ -2,18 +2,20 @@
 
 import hashlib
 from collections import OrderedDict
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vpd_lightning.encoder.base import AbstractBackground
 from vpd_lightning.geometry.cameras import unproject
-from vpd_lightning.geometry.noisy_planes import off_wide_planes, relative_noise
+from vpd_lightning.geometry.noisy_planes import hangs_alone, off_wide_planes, relative_noise
 from vpd_lightning.geometry.normals import depth_normals
 from vpd_lightning.geometry.wide_surfaces import wide_surfaces
-from vpd_lightning.types import Cameras, RGBDFrames
+from vpd_lightning.types import RGBDFrames
 
 
 class WideSurfaceBackground(AbstractBackground):
@@ -25,7 +27,8 @@ class WideSurfaceBackground(AbstractBackground):
 
     Where depth scatters by more than ``noise_floor`` (a share of it, found from the frame itself, camera by camera;
     null: never looked at) normals of neighbouring pixels are unreliable, and planes fitted to all views replace
-    surfaces: see ``geometry.noisy_planes``. Below it nothing is different from a perfect sensor.
+    surfaces, and pixels that hang in the air between two surfaces are left out: see ``geometry.noisy_planes``. Below
+    it nothing is different from a perfect sensor.
 
     The masks of the last ``memory_frames`` time steps are kept, in packed bits, by a digest of depth and cameras: a
     training sees each frame many times. Kept or computed, they are the same.
@@ -61,42 +64,73 @@ class WideSurfaceBackground(AbstractBackground):
         self.min_width, self.tolerance, self.memory_frames = min_width, tolerance, memory_frames
         self.noise_floor = noise_floor
         self._memory: OrderedDict[bytes, np.ndarray] = OrderedDict()
+        self._trusted: OrderedDict[bytes, np.ndarray] = OrderedDict()
 
     @torch.no_grad()
     def forward(self, frames: RGBDFrames) -> Bool[Tensor, "batch view height width"]:
         """Return which pixels may be moving."""
-        members = [self._member(frames[member]) for member in range(len(frames.depth))]
+        members = [self._remembered(self._memory, frames[member], self._loose) for member in range(len(frames.depth))]
         return torch.stack(members).to(frames.depth.device)
 
-    def _member(self, frames: RGBDFrames) -> Tensor:
+    @torch.no_grad()
+    def trusted(
+        self, frames: RGBDFrames, moving: Bool[Tensor, "batch view height width"]
+    ) -> Bool[Tensor, "batch view height width"]:
+        """Return which pixels measured a surface; in noisy depth some hang in the air between two."""
+        members = [
+            self._remembered(
+                self._trusted, frames[member], partial(self._not_alone, moving=moving[member].cpu().numpy())
+            )
+            for member in range(len(frames.depth))
+        ]
+        return torch.stack(members).to(frames.depth.device)
+
+    def _not_alone(self, frames: RGBDFrames, moving: np.ndarray) -> np.ndarray:
+        """Return the valid pixels that move, and those of the others that have others near them."""
+        frames = frames.to("cpu", torch.float32)
+        depth, valid, noise = self._measured(frames)
+        if noise is None:
+            return valid
+        points = unproject(depth, frames.cameras).numpy()
+        return valid & ~hangs_alone(points, valid & ~moving, depth.numpy() * _pixel_sizes(frames)[:, None, None])
+
+    def _measured(self, frames: RGBDFrames) -> tuple[Tensor, np.ndarray, np.ndarray | None]:
+        """Return depth, where it is valid, and each view's noise; None where that is below the floor."""
+        depth = torch.nan_to_num(frames.depth, nan=0.0, posinf=0.0, neginf=0.0)
+        valid = (depth > 0).numpy()
+        if self.noise_floor is None:
+            return depth, valid, None
+        noise = relative_noise(depth.double().numpy(), valid)
+        return depth, valid, noise if np.median(noise) > self.noise_floor else None
+
+    def _remembered(
+        self, memory: OrderedDict[bytes, np.ndarray], frames: RGBDFrames, find: Callable[[RGBDFrames], np.ndarray]
+    ) -> Tensor:
         key, shape = _digest(frames), frames.depth.shape
-        packed = self._memory.get(key)
+        packed = memory.get(key)
         if packed is None:
-            packed = np.packbits(self._loose(frames))
-            self._memory[key] = packed
-            while len(self._memory) > self.memory_frames:
-                self._memory.popitem(last=False)
+            packed = np.packbits(find(frames))
+            memory[key] = packed
+            while len(memory) > self.memory_frames:
+                memory.popitem(last=False)
         else:
-            self._memory.move_to_end(key)
+            memory.move_to_end(key)
         return torch.from_numpy(np.unpackbits(packed, count=shape.numel()).astype(bool).reshape(tuple(shape)))
 
     def _loose(self, frames: RGBDFrames) -> np.ndarray:
         frames = frames.to("cpu", torch.float32)
-        depth = torch.nan_to_num(frames.depth, nan=0.0, posinf=0.0, neginf=0.0)
-        valid = depth > 0
-        if self.noise_floor is not None:
-            noise = relative_noise(depth.double().numpy(), valid.numpy())
-            if np.median(noise) > self.noise_floor:
-                found = self._off_planes(depth, valid.numpy(), frames.cameras, noise)
-                if found is not None:
-                    return found
+        depth, valid, noise = self._measured(frames)
+        if noise is not None:
+            found = self._off_planes(depth, valid, frames, noise)
+            if found is not None:
+                return found
         intrinsics = frames.cameras.intrinsics
         focal = (intrinsics[..., 0, 0] + intrinsics[..., 1, 1]).expand(depth.shape[:1])[:, None, None] / 2
         normals = depth_normals(depth, frames.cameras).numpy()
         wide = wide_surfaces(
             unproject(depth, frames.cameras).numpy(),
             normals,
-            valid.numpy(),
+            valid,
             (depth / focal).numpy(),
             max_slope=self.max_slope,
             max_turn=self.max_turn,
@@ -104,13 +138,12 @@ class WideSurfaceBackground(AbstractBackground):
             tolerance=self.tolerance,
         )
         # Without a normal (image borders, single pixels) nothing is known; such pixels count as static.
-        return valid.numpy() & ~wide & ((normals**2).sum(axis=-1) > 0.5)
+        return valid & ~wide & ((normals**2).sum(axis=-1) > 0.5)
 
     def _off_planes(
-        self, depth: Tensor, valid: np.ndarray, cameras: Cameras, noise: np.ndarray
+        self, depth: Tensor, valid: np.ndarray, frames: RGBDFrames, noise: np.ndarray
     ) -> Bool[np.ndarray, "view height width"] | None:
-        intrinsics = cameras.intrinsics
-        focal = (intrinsics[..., 0, 0] + intrinsics[..., 1, 1]).expand(len(depth)) / 2
+        cameras = frames.cameras
         unit = unproject(torch.ones_like(depth), cameras).double().numpy()
         centers = cameras.cam_to_world[..., :3, 3].expand(len(depth), 3).double().numpy()
         return off_wide_planes(
@@ -119,9 +152,16 @@ class WideSurfaceBackground(AbstractBackground):
             centers,
             valid,
             noise,
-            (1 / focal).double().numpy(),
+            _pixel_sizes(frames),
             min_width=self.min_width,
         )
+
+
+def _pixel_sizes(frames: RGBDFrames) -> Float[np.ndarray, " view"]:
+    """Return what a pixel of each view covers, as a share of its depth."""
+    intrinsics = frames.cameras.intrinsics
+    focal = (intrinsics[..., 0, 0] + intrinsics[..., 1, 1]).expand(len(frames.depth)) / 2
+    return (1 / focal).double().numpy()
 
 
 def _digest(frames: RGBDFrames) -> bytes:
