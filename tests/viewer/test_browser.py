@@ -212,21 +212,24 @@ def test_it_opens_on_a_film_in_which_the_block_moves_as_predicted(page: Page, vi
 
 def test_every_step_has_its_picture_and_its_figures(page: Page, panel: Panel) -> None:
     for step in (1, 2, 3):
-        page.keyboard.press("ArrowRight")
-        wait_until(page, lambda step=step: int(panel.step.value) == step)
+        repeat_until(page, lambda: page.keyboard.press("ArrowRight"), lambda step=step: int(panel.step.value) >= step)
+        assert int(panel.step.value) == step
         page.get_by_text(f"step {step} of {STEPS}").wait_for()
         picture = panel.screen.film_picture(step)
         shown = metric(PSNR).shown(panel.session.measure(step, panel.screen.view, picture)[PSNR])
         page.get_by_text(f"{metric(PSNR).title} {shown} {metric(PSNR).printed_unit}").wait_for()
         wait_until(page, lambda step=step: distance(page, panel, PREDICTED, 3, panel.session.now, step) < 0.08)
     place = np.array(panel.client.camera.position)
-    page.keyboard.down("ArrowLeft")  # which viser would turn the camera by
-    page.wait_for_timeout(300)
-    page.keyboard.up("ArrowLeft")
-    wait_until(page, lambda: int(panel.step.value) == 2)
+
+    def hold_left() -> None:  # by which viser would turn the camera
+        page.keyboard.down("ArrowLeft")
+        page.wait_for_timeout(300)
+        page.keyboard.up("ArrowLeft")
+
+    repeat_until(page, hold_left, lambda: int(panel.step.value) < 3)
+    assert int(panel.step.value) == 2
     assert np.allclose(panel.client.camera.position, place)
-    page.keyboard.press(" ")
-    wait_until(page, lambda: panel._playing.is_set())
+    repeat_until(page, lambda: page.keyboard.press(" "), lambda: panel._playing.is_set())
     press(page, "Pause")
     wait_until(page, lambda: not panel._playing.is_set())
     now = int(panel.step.value)
@@ -245,8 +248,7 @@ def test_a_click_and_delete_take_the_block_and_its_shadow_away(page: Page, panel
     recorded, without, count = 0, 1, 2
     click_block(page, panel, PREDICTED, 3)
     assert panel.session.selector == Cluster(0)
-    page.keyboard.press("Delete")
-    wait_until(page, lambda: len(panel.session.operations()) == 1)
+    repeat_until(page, lambda: page.keyboard.press("Delete"), lambda: len(panel.session.operations()) == 1)
     page.get_by_text("edited: no truth to compare with").wait_for()
     page.get_by_text("as recorded").first.wait_for()
     wait_until(page, lambda: is_drawn(panel))
@@ -259,11 +261,9 @@ def test_a_click_and_delete_take_the_block_and_its_shadow_away(page: Page, panel
     shadow = before < 0.75 * floor  # block and shadow are the only dark things on the pale floor
     assert shadow.sum() > 100 and np.median(after[shadow]) > 0.9 * floor
 
-    page.keyboard.press("Control+z")
-    wait_until(page, lambda: panel.session.operations() == [])
+    repeat_until(page, lambda: page.keyboard.press("Control+z"), lambda: panel.session.operations() == [])
     wait_until(page, lambda: blue(pane(page, panel, PREDICTED, 3)).mean() > 0.002)
-    page.keyboard.press("Control+y")
-    wait_until(page, lambda: len(panel.session.operations()) == 1)
+    repeat_until(page, lambda: page.keyboard.press("Control+y"), lambda: len(panel.session.operations()) == 1)
     edited = panel.session.now.editor.scene
     assert same(vpd.SceneEditor(panel.opened.scene).delete(Cluster(0)).scene, edited)
 

@@ -39,7 +39,6 @@ def figures(metrics: Mapping[str, Any]) -> dict[str, Any]:
     motion = metrics["motion"]
     return {
         "updates": metrics["step"],
-        "minutes": metrics["training"].get("cpu_minutes"),
         "num_clips": metrics["protocol"]["num_clips"],
         "psnr_moving": metrics["psnr_moving"]["mean"],
         "psnr_moving_references": {name: value["psnr_moving"]["mean"] for name, value in metrics["references"].items()},
@@ -78,7 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=lambda text: [int(word) for word in text.split(",")], default=[0, 1])
     parser.add_argument("--conditions", type=lambda text: text.split(","), default=list(CONDITIONS)[:3])
     options = parser.parse_args(arguments)
-    cells = json.loads(options.out.read_text())["cells"] if options.out.is_file() else {}
+    known = json.loads(options.out.read_text()) if options.out.is_file() else {}
+    cells = known.get("cells", {})
     for seed in options.seeds:
         for scene in options.scenes:
             for condition in options.conditions:
@@ -87,10 +87,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     continue
                 cells[key] = measured(scene, condition, seed, options.work)
                 with AtomicPath(options.out) as part:
-                    result = {
-                        "command": "python -m docs.results.studies.noisy_depth",
-                        "cells": dict(sorted(cells.items())),
-                    }
+                    command = "python -m docs.results.studies.noisy_depth"
+                    result = {"command": command, **known, "cells": dict(sorted(cells.items()))}
                     part.write_text(json.dumps(result, indent=1) + "\n")
                 print(key, json.dumps(cells[key]), flush=True)
     return 0
