@@ -9,6 +9,7 @@ libraries pair them, move views across what only one of them sees.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import permutations
 
 import numpy as np
@@ -53,7 +54,7 @@ class _Scenery:
     images: Sequence[PosedDepth]
     surfaces: Sequence[SmoothSurface]
 
-    @property
+    @cached_property
     def tilt(self) -> float:
         """Variance of normals on smooth surfaces, in each direction."""
         return float(np.median(np.concatenate([_tilt(surface) for surface in self.surfaces])))

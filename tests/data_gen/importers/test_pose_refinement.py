@@ -120,8 +120,6 @@ def test_recordings_of_one_arrangement_share_their_poses_and_others_do_not():
 
 def test_a_pose_far_off_is_refused_and_one_that_sees_nothing_of_the_others_is_kept():
     poses = POSES.copy()
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_euler("z", 180, degrees=True).as_matrix()
     poses[2] = np.diag([1.0, -1, -1, 1.0])  # looks down from the origin: nothing in common
     poses[2, 2, 3] = 50.0
     found = refine_poses({"take": geometry(poses)}, 1)

@@ -77,6 +77,8 @@ class WideSurfaceBackground(AbstractBackground):
         self, frames: RGBDFrames, moving: Bool[Tensor, "batch view height width"]
     ) -> Bool[Tensor, "batch view height width"]:
         """Return which pixels measured a surface; in noisy depth some hang in the air between two."""
+        if self.noise_floor is None:
+            return super().trusted(frames, moving)
         members = [
             self._remembered(
                 self._trusted, frames[member], partial(self._not_alone, moving=moving[member].cpu().numpy())
