@@ -90,7 +90,7 @@ def _look(geometries: Mapping[str, ImageGeometry], settings: ImportSettings) -> 
     poses: Mapping[str, NDArray[np.float64]] = {}
     remarks: list[str] = []
     if settings.refine_poses:
-        refined = refine_poses(geometries, settings.every)
+        refined = refine_poses(geometries, settings.every, settings.scale or 1.0)
         poses, remarks = refined.poses, list(refined.remarks)
         geometries = {
             name: ImageGeometry(replace(geometry.recording, cam_to_world=poses[name]), settings)

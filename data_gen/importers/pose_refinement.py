@@ -69,8 +69,10 @@ class _Step:
     num_kept: int
 
 
-def refine_poses(geometries: Mapping[str, ImageGeometry], every: int) -> RefinedPoses:
+def refine_poses(geometries: Mapping[str, ImageGeometry], every: int, unit: float = 1.0) -> RefinedPoses:
     """Refine the poses of all recordings; those with the same cameras in the same places are refined together.
+
+    ``every`` keeps every n-th frame; ``unit`` is metres per unit of the source, for what is told.
 
     Raises:
         ConfigError: there is one view, or cameras move.
@@ -90,14 +92,14 @@ def refine_poses(geometries: Mapping[str, ImageGeometry], every: int) -> Refined
     remarks = []
     for names in arrangements.values():
         chosen = names[:: max(1, -(-len(names) // _MAX_RECORDINGS))]
-        refined, lines = _refine([geometries[name] for name in chosen], every)
+        refined, lines = _refine([geometries[name] for name in chosen], every, unit)
         poses.update(dict.fromkeys(names, refined))
         others = f" and {len(names) - 1} more" if len(names) > 1 else ""
         remarks += [f"refined poses of {names[0]}{others}:", *(f"  {line}" for line in lines)]
     return RefinedPoses(poses, remarks)
 
 
-def _refine(geometries: Sequence[ImageGeometry], every: int) -> tuple[Array, list[str]]:
+def _refine(geometries: Sequence[ImageGeometry], every: int, unit: float) -> tuple[Array, list[str]]:
     """Return poses (view, 4, 4) and lines for a person."""
     first = geometries[0].recording
     sceneries = [_scenery(geometry, every) for geometry in geometries]
@@ -120,18 +122,19 @@ def _refine(geometries: Sequence[ImageGeometry], every: int) -> tuple[Array, lis
         turn = np.degrees(Rotation.from_matrix(poses[view, :3, :3] @ given[view, :3, :3].T).magnitude())
         if moved > _MAX_SHIFT * np.median(depths) or turn > _MAX_TURN:
             raise DataError(
-                f"{label}: the pose that fits the surfaces is {100 * moved:.1f} cm and {turn:.1f} degrees from the one "
-                "given, too far for a refinement.\nCalibrate the cameras again, or import without refine_poses and let "
+                f"{label}: the pose that fits the surfaces is {100 * unit * moved:.1f} cm and {turn:.1f} degrees from the "
+                "one given, too far for a refinement.\nCalibrate the cameras again, or import without refine_poses and let "
                 "vpd-data validate say which convention is wrong."
             )
         far = moved > _FAR_SHIFT * np.median(depths)
         doubt = "; far for a refinement: look at points.png of vpd-data inspect" if far else ""
-        lines.append(f"{label}: moved by {1000 * moved:.1f} mm, turned by {turn:.2f} degrees{doubt}")
+        lines.append(f"{label}: moved by {1000 * unit * moved:.1f} mm, turned by {turn:.2f} degrees{doubt}")
     if step.num_kept:
         parts = 6 * (first.num_views - 1)
         lines.append(f"the surfaces do not determine {step.num_kept} of the {parts} parts of these motions: kept")
     if np.isfinite(after):
-        lines.append(f"what two views see lies {1000 * after:.1f} mm apart (median); before, {1000 * before:.1f} mm")
+        millimetres = [f"{1000 * unit * distance:.1f} mm" for distance in (after, before)]
+        lines.append(f"what two views see lies {millimetres[0]} apart (median); before, {millimetres[1]}")
     return poses, lines
 
 

@@ -87,6 +87,8 @@ def test_misplaced_cameras_find_back():
     text = "\n".join(found.remarks)
     assert "view 1 (middle): moved by 2" in text
     assert "lies 0.0 mm apart (median); before, 7" in text
+    halved = "\n".join(refine_poses({"take": geometry(misplaced())}, 1, unit=0.5).remarks)
+    assert "view 1 (middle): moved by 13" in halved
 
 
 def test_noise_leaves_true_poses_alone_and_still_mends_wrong_ones():
