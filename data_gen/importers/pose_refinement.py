@@ -122,9 +122,9 @@ def _refine(geometries: Sequence[ImageGeometry], every: int, unit: float) -> tup
         turn = np.degrees(Rotation.from_matrix(poses[view, :3, :3] @ given[view, :3, :3].T).magnitude())
         if moved > _MAX_SHIFT * np.median(depths) or turn > _MAX_TURN:
             raise DataError(
-                f"{label}: the pose that fits the surfaces is {100 * unit * moved:.1f} cm and {turn:.1f} degrees from the "
-                "one given, too far for a refinement.\nCalibrate the cameras again, or import without refine_poses and let "
-                "vpd-data validate say which convention is wrong."
+                f"{label}: the pose that fits the surfaces is {100 * unit * moved:.1f} cm and {turn:.1f} degrees "
+                "from the one given, too far for a refinement.\nCalibrate the cameras again, or import without "
+                "refine_poses and let vpd-data validate say which convention is wrong."
             )
         far = moved > _FAR_SHIFT * np.median(depths)
         doubt = "; far for a refinement: look at points.png of vpd-data inspect" if far else ""
