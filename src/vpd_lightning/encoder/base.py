@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vpd_lightning.randomness import RandomKeys
@@ -30,6 +30,10 @@ class AbstractBackground(nn.Module, ABC):
     @abstractmethod
     def forward(self, frames: RGBDFrames) -> Bool[Tensor, "batch view height width"]:
         """Return which pixels may be moving."""
+
+    def restored(self, frames: RGBDFrames) -> Float[Tensor, "batch view height width"]:
+        """Return the depth (metres) that particles are placed by; here the measured one."""
+        return frames.depth
 
     def trusted(
         self, frames: RGBDFrames, moving: Bool[Tensor, "batch view height width"]

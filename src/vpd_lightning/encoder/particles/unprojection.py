@@ -109,13 +109,14 @@ class UnprojectingEncoder(AbstractEncoder):
         Raises:
             EmptyWorkspaceError: no pixel of a batch member lies in the workspace.
         """
+        judged, frames = self._restored(frames)
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
         measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
         moving, still, far = None, measured, ~measured
         if self.background is not None:
-            dynamic_mask = self.background(_cropped(frames, candidates))
-            trusted = self.background.trusted(frames, dynamic_mask).flatten(1)
+            dynamic_mask = self.background(_cropped(judged, candidates))
+            trusted = self.background.trusted(judged, dynamic_mask).flatten(1)
             measured, candidates = measured & trusted, candidates & trusted
             moving, border = (pixels.flatten(1) for pixels in _with_border(dynamic_mask))
             candidates, still = candidates & ~border, measured & ~moving & ~border
@@ -149,21 +150,36 @@ class UnprojectingEncoder(AbstractEncoder):
         assert normals is not None
         return replace(particles, scenery=scenery_of(frames, everywhere, normals, still, far, occluders_of(particles)))
 
+    def _restored(self, frames: RGBDFrames) -> tuple[RGBDFrames, RGBDFrames]:
+        """Return the frames by which it is judged what moves, and those whose depth places the particles.
+
+        What was measured is judged as it was measured: thresholds follow from its noise.
+        """
+        if self.background is None:
+            return frames, frames
+        depth = self.background.restored(frames)
+        measured = torch.isfinite(frames.depth) & (frames.depth > 0)
+        return replace(frames, depth=torch.where(measured, frames.depth, depth)), replace(frames, depth=depth)
+
     @torch.no_grad()
     def moving_pixels(
         self, frames: RGBDFrames
     ) -> tuple[Bool[Tensor, "batch view height width"], Bool[Tensor, "batch view height width"]]:
-        """Return which pixels may move, and which are measured and in the workspace (the first are among these).
+        """Return which pixels may move, and which have a depth in the workspace (the first are among these).
 
         Raises:
             ValueError: the encoder has no background model.
         """
         if self.background is None:
             raise ValueError("what may move is found by a background model; set encoder.background")
+        return self._moving(*self._restored(frames))
+
+    def _moving(self, judged: RGBDFrames, frames: RGBDFrames) -> tuple[Tensor, Tensor]:
+        assert self.background is not None
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
         measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
-        moving = self.background(_cropped(frames, candidates)) & candidates.view_as(frames.depth)
+        moving = self.background(_cropped(judged, candidates)) & candidates.view_as(frames.depth)
         return moving, candidates.view_as(frames.depth)
 
     @torch.no_grad()
@@ -171,8 +187,9 @@ class UnprojectingEncoder(AbstractEncoder):
         """Return a quarter as many points that may move as there are particles; nothing without a background."""
         if self.background is None:
             return {}
+        # As measured: to restore every later frame would cost a short training most of its time.
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
-        dynamic_mask = self.moving_pixels(frames)[0].flatten(1)
+        dynamic_mask = self._moving(frames, frames)[0].flatten(1)
         count = max(1, self.num_particles // 4)
         drawn = [
             workspace.choose(allowed, count, generator)

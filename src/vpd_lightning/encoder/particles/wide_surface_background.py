@@ -3,6 +3,7 @@
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,10 +13,14 @@ from torch import Tensor
 
 from vpd_lightning.encoder.base import AbstractBackground
 from vpd_lightning.geometry.cameras import unproject
+from vpd_lightning.geometry.local_planes import plane_depth
 from vpd_lightning.geometry.noisy_planes import hangs_alone, off_wide_planes, relative_noise
 from vpd_lightning.geometry.normals import depth_normals
 from vpd_lightning.geometry.wide_surfaces import wide_surfaces
 from vpd_lightning.types import RGBDFrames
+
+_MAX_BYTES = 2**29
+"""Of smoothed depth that is kept."""
 
 
 class WideSurfaceBackground(AbstractBackground):
@@ -27,11 +32,13 @@ class WideSurfaceBackground(AbstractBackground):
 
     Where depth scatters by more than ``noise_floor`` (a share of it, found from the frame itself, camera by camera;
     null: never looked at) normals of neighbouring pixels are unreliable, and planes fitted to all views replace
-    surfaces, and pixels that hang in the air between two surfaces are left out: see ``geometry.noisy_planes``. Below
-    it nothing is different from a perfect sensor.
+    surfaces, and pixels that hang in the air between two surfaces are left out: see ``geometry.noisy_planes``. Depth
+    is smoothed, and continued to pixels that were lost beside a surface: see ``geometry.local_planes``. Below the
+    floor nothing is different from a perfect sensor.
 
     The masks of the last ``memory_frames`` time steps are kept, in packed bits, by a digest of depth and cameras: a
-    training sees each frame many times. Kept or computed, they are the same.
+    training sees each frame many times. Kept or computed, they are the same. So is smoothed depth, half a gigabyte of
+    it at most.
     """
 
     # Paper: not in the paper; it gives the inertial dynamics its candidates for motion. Region growing over smooth
@@ -65,12 +72,42 @@ class WideSurfaceBackground(AbstractBackground):
         self.noise_floor = noise_floor
         self._memory: OrderedDict[bytes, np.ndarray] = OrderedDict()
         self._trusted: OrderedDict[bytes, np.ndarray] = OrderedDict()
+        self._restored: OrderedDict[bytes, np.ndarray | None] = OrderedDict()  # None: as measured
 
     @torch.no_grad()
     def forward(self, frames: RGBDFrames) -> Bool[Tensor, "batch view height width"]:
         """Return which pixels may be moving."""
         members = [self._remembered(self._memory, frames[member], self._loose) for member in range(len(frames.depth))]
         return torch.stack(members).to(frames.depth.device)
+
+    @torch.no_grad()
+    def restored(self, frames: RGBDFrames) -> Float[Tensor, "batch view height width"]:
+        """Return the depth (metres) of local planes where it is noisy, and where it is missing beside a surface."""
+        if self.noise_floor is None:
+            return frames.depth
+        return torch.stack([self._restored_member(frames[member]) for member in range(len(frames.depth))])
+
+    def _restored_member(self, frames: RGBDFrames) -> Float[Tensor, "view height width"]:
+        key, memory = _digest(frames, frames.rgb), self._restored
+        if key in memory:
+            memory.move_to_end(key)
+        else:
+            memory[key] = self._fitted_depth(frames)
+            held = sum(depth.nbytes for depth in memory.values() if depth is not None)
+            while len(memory) > 1 and (len(memory) > self.memory_frames or held > _MAX_BYTES):
+                oldest = memory.popitem(last=False)[1]
+                held -= 0 if oldest is None else oldest.nbytes
+        found = memory[key]
+        return frames.depth if found is None else torch.from_numpy(found).to(frames.depth)
+
+    def _fitted_depth(self, frames: RGBDFrames) -> np.ndarray | None:
+        rgb = frames.rgb if frames.rgb.is_floating_point() else frames.rgb.float() / 255
+        frames = replace(frames, rgb=rgb).to("cpu", torch.float32)
+        depth, _, noise = self._measured(frames)
+        if noise is None:
+            return None
+        sizes = torch.from_numpy(_pixel_sizes(frames)).float()
+        return plane_depth(depth, frames.rgb, torch.from_numpy(noise).float(), sizes).numpy()
 
     @torch.no_grad()
     def trusted(
@@ -166,9 +203,9 @@ def _pixel_sizes(frames: RGBDFrames) -> Float[np.ndarray, " view"]:
     return (1 / focal).double().numpy()
 
 
-def _digest(frames: RGBDFrames) -> bytes:
+def _digest(frames: RGBDFrames, *others: Tensor) -> bytes:
     digest = hashlib.blake2b(digest_size=16)
-    for values in (frames.depth, frames.cameras.intrinsics, frames.cameras.cam_to_world):
+    for values in (frames.depth, frames.cameras.intrinsics, frames.cameras.cam_to_world, *others):
         digest.update(str((values.dtype, tuple(values.shape))).encode())
         digest.update(values.detach().cpu().contiguous().numpy().tobytes())
     return digest.digest()

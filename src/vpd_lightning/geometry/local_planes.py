@@ -1,0 +1,115 @@
+"""Noisy depth as planes fitted around every pixel: it scatters less, and pixels beside a surface get its depth."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vpd_lightning.geometry.decay import decay
+
+_REACH = 3
+"""Pixels to each side whose depth is looked at."""
+
+_WIDTH = 2.0
+"""Pixels: standard deviation of the weights of neighbours."""
+
+_COLOR_SCALE = 0.1
+"""Difference in colour at which a neighbour counts as of another surface: shades of one differ by less."""
+
+_JUMP, _ROBUST = 2.0, 3.0
+"""Pixel sizes and standard deviations of the noise beyond which a neighbour lies on another surface."""
+
+_RIDGE = 0.05
+"""Pull of the slope to zero, in weights of one neighbour, where too few neighbours determine it."""
+
+_NUM_ROUNDS = 3
+
+_MIN_WEIGHT = 1.0
+"""Sum of the neighbours' weights below which a missing pixel stays missing."""
+
+_MAX_CORRECTION = 4.0
+"""Standard deviations of the noise by which a fit may move what was measured."""
+
+
+@torch.no_grad()
+def plane_depth(
+    depth: Float[Tensor, "image height width"],
+    rgb: Float[Tensor, "image height width 3"],
+    noise: Float[Tensor, " image"],
+    pixel_sizes: Float[Tensor, " image"],
+) -> Float[Tensor, "image height width"]:
+    """Return the depth (metres) of planes fitted around every pixel; 0 where nothing was measured near it.
+
+    The inverse depth of a plane is linear in the picture. Around each pixel such a plane is fitted to neighbours of
+    like colour (in [0, 1]) by iteratively reweighted least squares, starting from the pixel's own depth, or from the
+    median of such neighbours where it has none (0 or not finite). A camera loses pixels at outlines most, other ones
+    in every frame, and a body would seem to move by that; the colours show where it ends. What is measured is moved
+    by a few standard deviations at most: a pixel between two surfaces keeps its depth.
+
+    ``noise`` is the standard deviation of each image as a share of depth, ``pixel_sizes`` what a pixel covers as a
+    share of depth. Joint bilateral filtering (Petschnigg et al. 2004; Eisemann and Durand 2004), with planes for
+    constants and robust weights for the range filter.
+    """
+    return torch.stack([_fitted(*image) for image in zip(depth, rgb, noise, pixel_sizes, strict=True)])
+
+
+def _fitted(depth: Tensor, rgb: Tensor, noise: Tensor, pixel_size: Tensor) -> Float[Tensor, "height width"]:
+    depth = torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0).clamp(min=0)
+    steps = torch.arange(-_REACH, _REACH + 1, dtype=depth.dtype, device=depth.device)
+    rows, columns = (axis.flatten() for axis in torch.meshgrid(steps, steps, indexing="ij"))
+    rgb, noise, pixel_size = rgb.to(depth), noise.to(depth), pixel_size.to(depth)
+    around = _windows(torch.where(depth > 0, 1 / depth, 0.0)[None])[0]  # 1/m; zero where there is none
+    known = around > 0
+    difference = (_windows(rgb.movedim(-1, 0)) - rgb.reshape(1, -1, 3).permute(2, 1, 0)).square().sum(dim=0)
+    difference = torch.where(known, difference, torch.inf)
+    most_alike = difference.amin(dim=1, keepdim=True)
+    distance = (rows.square() + columns.square()) / (2 * _WIDTH**2)
+    weights = decay(-distance - (difference - most_alike.clamp(max=1e9)) / (2 * _COLOR_SCALE**2))
+
+    own, measured = depth.flatten()[:, None], depth.flatten() > 0
+    start = torch.where(own > 0, 1 / own, 0.0)
+    start[~measured] = _median(around[~measured], weights[~measured])
+    start = start.clamp(min=1e-30)
+    values = around / start - 1  # of the inverse depth at the start, so that all that follows has its digits
+    scale = (_ROBUST * noise).clamp(min=1e-6)
+    offsets = torch.stack([torch.ones_like(rows), columns, rows], dim=1)
+    products = (offsets[:, :, None] * offsets[:, None, :]).flatten(1)
+    pull = torch.diag(torch.tensor([1e-6, _RIDGE, _RIDGE], dtype=depth.dtype, device=depth.device))
+    robust = _robust(weights, values, torch.maximum(scale, _JUMP * pixel_size))
+    for _ in range(_NUM_ROUNDS):
+        matrix = (robust @ products).unflatten(1, (3, 3)) + pull
+        planes = torch.linalg.solve(matrix, (robust * values) @ offsets)
+        robust = _robust(weights, values - planes @ offsets.mT, scale)
+
+    nearness = start[:, 0] * (1 + planes[:, 0])
+    fitted = torch.where(nearness > 0, 1 / nearness, 0.0)
+    shift = planes[:, 0].abs()
+    is_fine = torch.where(
+        measured,
+        shift < _MAX_CORRECTION * noise,
+        (robust.sum(dim=1) > _MIN_WEIGHT)
+        & (shift < 2 * torch.maximum(scale, _JUMP * pixel_size))
+        & (most_alike[:, 0] < (3 * _COLOR_SCALE) ** 2),
+    )
+    return torch.where(is_fine, fitted, own[:, 0]).view_as(depth)
+
+
+def _windows(images: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel pixel neighbour"]:
+    """Return what surrounds each pixel; zeros beyond the border."""
+    size = 2 * _REACH + 1
+    columns = torch.nn.functional.unfold(images[:, None], size, padding=_REACH)
+    return columns.transpose(1, 2).contiguous()
+
+
+def _robust(weights: Tensor, residuals: Tensor, scale: Tensor) -> Tensor:
+    """Return the weights without neighbours whose residual is far beyond the scale (Geman and McClure)."""
+    return weights / (1 + (residuals / scale).square()).square()
+
+
+def _median(
+    values: Float[Tensor, "pixel neighbour"], weights: Float[Tensor, "pixel neighbour"]
+) -> Float[Tensor, "pixel 1"]:
+    """Return the weighted median over neighbours."""
+    ordered, order = values.sort(dim=1)
+    sums = torch.gather(weights, 1, order).cumsum(dim=1)
+    middle = (sums >= sums[:, -1:] / 2).to(torch.uint8).argmax(dim=1, keepdim=True)
+    return torch.gather(ordered, 1, middle)
