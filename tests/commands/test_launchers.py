@@ -30,6 +30,7 @@ def test_each_run_has_a_process_and_a_folder(quick: list[str], in_folder: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.launcher
 def test_a_run_that_fails_elsewhere_fails_here(quick: list[str], in_folder: Path):
     code, output = multirun([*quick, "data.num_steps=40"], in_folder)

@@ -163,7 +163,9 @@ def test_wrong_arguments_are_refused(tmp_path: Path, changes: dict[str, object],
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.exhaustive)]
+)
 def test_stopped_with_workers_leaves_no_half_file(tmp_path: Path, number: signal.Signals, code: int):
     out = tmp_path / "out"
     words = ["scene=mujoco_block", "preset=tiny", f"out={out}", "splits.train=2000", "workers=2", "num_frames=30"]

@@ -15,8 +15,12 @@ from vpd_lightning.data.manifest import load_manifest
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["splits.train=3", "splits.validation=1", "splits.test=1", "num_frames=4", "camera.num_views=2"]
-# One scene of each family; soft bodies, random textures and meshes are what could differ between processes.
-SCENES = ("mujoco_block", "deformable_collision", "movi_c")
+# One scene of each family; soft bodies, random textures and meshes are what could differ between processes. The block's
+# workers and kills are tested in test_generate.py, the same bytes of meshes in movi/test_pictures.py.
+SCENES = [
+    "deformable_collision",
+    *(pytest.param(scene, marks=pytest.mark.exhaustive) for scene in ("mujoco_block", "movi_c")),
+]
 
 
 def start(scene: str, out: Path, workers: int, *words: str) -> subprocess.Popen[bytes]:

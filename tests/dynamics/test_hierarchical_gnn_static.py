@@ -190,6 +190,7 @@ def compile_with(backend: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_static_step_compiles_in_one_graph_and_gives_the_same() -> None:
     result = compile_with("aot_eager")
     assert result.returncode == 0, result.stdout + result.stderr

@@ -12,11 +12,11 @@ from vpd_lightning.errors import ConfigError, DataError
 from vpd_lightning.runs.one_recording import choose_trajectory, data_set
 from vpd_lightning.runs.provide_data import provide_data
 
-WHOLE = Path("datasets/mujoco_block_demo")
+WHOLE = Path("datasets/mujoco_block_tiny")
 CONFIG = {
-    "experiment": "demo",
+    "experiment": "tiny",
     "data": {"folder": str(WHOLE)},
-    "generate": {"scene": "mujoco_block", "preset": "demo", "seed": 3, "when_missing": True},
+    "generate": {"scene": "mujoco_block", "preset": "tiny", "seed": 3, "when_missing": True},
 }
 
 
@@ -42,7 +42,7 @@ def test_it_is_the_trajectory_of_the_whole_data_set_and_made_once(capsys: pytest
         assert data_set(None, CONFIG, only=("test", number)).digest == shown.digest
         assert "making" not in capsys.readouterr().out
     sizes = {"splits.train": 1, "splits.validation": 1, "splits.test": 3}
-    generate("mujoco_block", "demo", WHOLE, seed=3, overrides=sizes)
+    generate("mujoco_block", "tiny", WHOLE, seed=3, workers=1, overrides=sizes)
     assert data_set(None, CONFIG, only=("test", 1)).folder.name == WHOLE.name  # now that it is there, it is taken
     one, other = (choose_trajectory(found, "test", 1) for found in (shown, load_manifest(WHOLE)))
     np.testing.assert_array_equal(pictures(one), pictures(other))
@@ -57,7 +57,7 @@ def test_recordings_of_other_settings_are_not_taken_for_it():
 
 @pytest.mark.parametrize("only", [("test", 32), ("test", -1), ("tests", 0)])
 def test_a_trajectory_that_the_whole_data_set_would_not_have_is_not_made(only: tuple[str, int]):
-    message = rf"There is no trajectory {only[1]} in split {only[0]}.\n.*train 160, validation 16, test 32"
+    message = rf"There is no trajectory {only[1]} in split {only[0]}.\n.*train 4, validation 2, test 2"
     with pytest.raises(ConfigError, match=message):
         provide_data(CONFIG, only=only)
     assert not Path("datasets").exists()

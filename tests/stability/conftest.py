@@ -14,7 +14,7 @@ FOLDER = Path(__file__).parent
 
 @pytest.hookimpl(tryfirst=True)  # before -m looks at markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as exhaustive every case whose values meet, two by two, in other cases of the same file.
+    """Mark as exhaustive every case whose values meet, two by two, in other cases of the same file that are not.
 
     The test is one more factor: each of them sees every value of each of its parameters, and every two values that
     meet in the file meet in one of its tests.
@@ -22,6 +22,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     cases_of: dict[str, list[pytest.Function]] = defaultdict(list)
     for item in items:
         if item.path.is_relative_to(FOLDER) and isinstance(item, pytest.Function) and hasattr(item, "callspec"):
+            if item.get_closest_marker("exhaustive"):
+                continue
             cases_of[str(item.path)].append(item)
     for cases in cases_of.values():
         values = [{name: repr(value) for name, value in case.callspec.params.items()} for case in cases]

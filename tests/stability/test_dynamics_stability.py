@@ -226,7 +226,7 @@ def test_the_order_of_particles_does_not_matter(option: str, mode: Mode, device:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps", [100, 1000])  # every option and every precision meets both in `make test`
+@pytest.mark.parametrize("steps", [100, 300, pytest.param(1000, marks=pytest.mark.exhaustive)])
 def test_many_steps_stay_finite_and_drift_no_faster_than_the_tanh_allows(
     option: str, steps: int, mode: Mode, device: torch.device
 ):

@@ -23,7 +23,9 @@ def test_triton_kernels_pass_the_matrix_in_the_interpreter(request: pytest.Fixtu
     files = [f"tests/stability/{name}" for name in FILES]
     command = [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", "-p", "no:xdist", *files]
     if "not exhaustive" in request.config.getoption("markexpr"):
-        command += ["-m", "not exhaustive"]
+        # An interpreter runs one program after the other: it repeats itself, and the order of points tells it nothing
+        # that the comparison with float64 does not.
+        command += ["-m", "not exhaustive", "-k", "not repeats_bit_for_bit and not order_of_points"]
 
     result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
 

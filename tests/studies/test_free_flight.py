@@ -10,6 +10,7 @@ from vpd_lightning.testing.free_flight import FreeFlight
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_rows_are_trained_once_and_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(free_flight, "SCENE", FreeFlight(image_size=16, num_cameras=2))
     monkeypatch.setattr(free_flight, "NUM_TEST", 2)

@@ -28,6 +28,7 @@ def test_slope_and_correlation_are_those_of_each_body_beside_the_mean() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_untrained_model_is_measured_once(tmp_path: Path) -> None:
     from data_gen.generate import generate
 

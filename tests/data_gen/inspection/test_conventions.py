@@ -113,7 +113,7 @@ def test_correct_data_have_no_fault(tmp_path: Path, sensor: str, seed: int):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("seeds", [range(20, 24), pytest.param(range(24, 35), marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("seeds", [range(20, 22), pytest.param(range(22, 35), marks=pytest.mark.exhaustive)])
 def test_correct_data_of_many_scenes_have_no_fault(tmp_path: Path, sensor: str, seeds: range):
     for seed in seeds:
         shape = {"num_views": 2 + seed % 4} if seed % 3 else {"num_views": 1, "num_frames": 9, "is_moving": True}

@@ -18,8 +18,7 @@ ONE = {"splits.train": 1, "splits.validation": 0, "splits.test": 0}
     "scene",
     [
         "movi_a",
-        "movi_c_high",
-        *(pytest.param(f"movi_{name}", marks=pytest.mark.exhaustive) for name in ("b", "c", "a_high")),
+        *(pytest.param(f"movi_{name}", marks=pytest.mark.exhaustive) for name in ("b", "c", "a_high", "c_high")),
     ],
 )
 def test_full_size_trajectory_is_valid(scene: str, tmp_path: Path):
