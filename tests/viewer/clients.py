@@ -39,11 +39,11 @@ def drain(connection: Any) -> None:
     threading.Thread(target=read, daemon=True).start()
 
 
-def camera_message() -> bytes:
+def camera_message(position: tuple[float, float, float] = (0.0, 0.0, 3.0)) -> bytes:
     """A browser reports its camera first; until then viser announces no client."""
     return serialized(
         _messages.ViewerCameraMessage(
-            (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 3.0), 0.9, 0.01, 100.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+            (1.0, 0.0, 0.0, 0.0), position, 0.9, 0.01, 100.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
         )
     )
 

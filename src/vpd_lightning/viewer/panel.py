@@ -55,6 +55,7 @@ class Panel(TabHost):
         self._busy, self._truth_busy, self._stepping = threading.Lock(), threading.Lock(), threading.RLock()
         self._first_shown = threading.Event()
         self._told, self._arrived = np.zeros(3), False  # where the browser's camera was put, and whether it went there
+        self._strayed = np.zeros(3)  # where it was instead when it was put there again
         gui: Any = client.gui
         self.look_through(self.screen.view)
         gui.add_markdown(f"### {opened.title}")
@@ -339,8 +340,11 @@ class Panel(TabHost):
 
     def look_through(self, view: int) -> None:
         """Put the browser's camera where a recorded one is, and show its film."""
-        cameras, camera = self.opened.cameras, self.client.camera
         self.screen.view = view
+        self._put_camera(view)
+
+    def _put_camera(self, view: int) -> None:
+        cameras, camera = self.opened.cameras, self.client.camera
         pose = cameras.cam_to_world[view].double().numpy()
         self._told, self._arrived = pose[:3, 3], False
         with self.client.atomic():
@@ -350,12 +354,18 @@ class Panel(TabHost):
             camera.fov = float(2 * np.arctan(0.5 * cameras.height / cameras.intrinsics[view, 1, 1]))
 
     def _camera_moved(self) -> None:
-        distance = np.linalg.norm(np.asarray(self.client.camera.position) - self._told)
-        is_there = distance < _MOVED * np.linalg.norm(self.opened.target - self._told)
+        position = np.asarray(self.client.camera.position)
+        is_there = np.linalg.norm(position - self._told) < _MOVED * np.linalg.norm(self.opened.target - self._told)
         self._arrived |= bool(is_there)
         if self.screen.mode == FILM and self._arrived and not is_there:
             self.set_mode(PICTURE)  # a film is that of a recorded camera
-        elif self.screen.mode != PARTICLES:
+            return
+        # A visitor who turns the camera before it is known to have arrived would never leave the film, however often:
+        # what is reported is where it is by now. Once for each place, should a browser keep it elsewhere.
+        if self.screen.mode == FILM and not is_there and not np.array_equal(position, self._strayed):
+            self._strayed = position
+            self._put_camera(self.screen.view)
+        if self.screen.mode != PARTICLES:
             self.ask_picture()  # also where the canvas has another size
 
     def set_mode(self, mode: str) -> None:
