@@ -24,7 +24,7 @@ def assert_kept(outcomes: list[Outcome]) -> None:
 def test_a_killed_training_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kills, "STEPS", 40)
 
-    assert_kept(kills.kills(tmp_path, num_chains=1, num_kills=1, num_in_writing=1))
+    assert_kept(kills.kills(tmp_path, num_chains=1, num_kills=2, num_in_writing=1))
 
     (metrics,) = (tmp_path / "killed_0").glob("metrics.csv")
     metrics.write_text(metrics.read_text().replace("\n20,", "\n21,", 1))

@@ -55,7 +55,7 @@ def test_recordings_of_other_settings_are_not_taken_for_it():
         provide_data(other, only=("test", 0))
 
 
-@pytest.mark.parametrize("only", [("test", 32), ("test", -1), ("tests", 0)])
+@pytest.mark.parametrize("only", [("test", 2), ("test", -1), ("tests", 0)])
 def test_a_trajectory_that_the_whole_data_set_would_not_have_is_not_made(only: tuple[str, int]):
     message = rf"There is no trajectory {only[1]} in split {only[0]}.\n.*train 4, validation 2, test 2"
     with pytest.raises(ConfigError, match=message):
