@@ -11,6 +11,9 @@ BIN := $(VENV)/bin
 # What to install as PyTorch. For a build from one of PyTorch's own indexes (CPU only, another CUDA) set pip's
 # environment, e.g. PIP_EXTRA_INDEX_URL, and name the build here: make setup TORCH=torch==2.13.0+cpu
 TORCH ?= torch==2.13.0
+# What installs all but PyTorch. CI takes uv, which is twice as fast; PyTorch always comes by pip, whose settings say
+# which build.
+INSTALL ?= $(BIN)/python -m pip install
 # Test processes. Each computes on one thread, so that they share the cores instead of fighting over them.
 WORKERS ?= 2
 # More words for pytest: make test PYTEST_ARGS="--cpu-seconds=seconds.json" writes where the processor seconds go.
@@ -36,7 +39,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), f"Python 3.11 to 3.13 is needed, this is {sys.version.split()[0]}: make setup PYTHON=python3.12"'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -c constraints.txt "$(TORCH)"
-	$(BIN)/python -m pip install -c constraints.txt -e ".[dev]"
+	$(INSTALL) -c constraints.txt -e ".[dev]"
 	touch $@
 
 install: ## Install the project into the environment that is active now, without a .venv
