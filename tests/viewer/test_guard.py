@@ -2,8 +2,10 @@
 
 import gzip
 import http.client
+import math
 import socket
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -153,6 +155,29 @@ def test_uploads_beyond_the_cap_and_beyond_what_was_announced_are_dropped(viewer
         for part in (0, 1):
             connection.send(serialized(_messages.FileTransferPart(target, "a", part, b"12345")))
         wait_until(lambda: set(pending) == {"b"})
+
+
+def test_values_beyond_what_an_input_allows_are_held_to_it_or_dropped(viewer: Viewer) -> None:
+    """Steps to simulate end at 1,000: a page that asks for 1e308 would fill the memory."""
+    before = set(viewer.panels)
+    with socket_of(viewer) as connection:
+        connection.send(camera_message())
+        drain(connection)
+        tab = settled_panel(viewer, before).view_tab
+
+        def set_to(handle: Any, **updates: Any) -> None:
+            connection.send(serialized(_messages.GuiUpdateMessage(handle._impl.uuid, updates)))
+
+        set_to(tab.camera, value="none that exists")
+        set_to(tab.point_size, value=math.nan)
+        set_to(tab.point_size, value="large")
+        set_to(tab.fps, value=-1e308)
+        set_to(tab.length, max=1e308)
+        set_to(tab.length, removed=True)
+        set_to(tab.length, value=1e308)
+        wait_until(lambda: tab.length.value == 1000)  # messages come in order
+        assert tab.fps.value == 1 and tab.length.max == 1000 and not tab.length._impl.removed
+        assert tab.camera.value in tab.camera.options and math.isfinite(tab.point_size.value)
 
 
 JUNK = (None, True, -1, 3.5, float("nan"), 1e308, "", "x" * 500, b"\0\xff", [], [1, "a"], {}, {"value": 1}, [0.0] * 4)

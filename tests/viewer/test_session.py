@@ -63,6 +63,15 @@ def test_an_edit_in_between_ends_a_simulation(opened: OpenedScene) -> None:
     assert session.now.num_steps == 0
 
 
+def test_where_nobody_looks_any_more_nothing_is_simulated(opened: OpenedScene) -> None:
+    session = Session(opened)
+    session.apply(Delete(LEFT))
+    assert session.simulate(1000, is_left=lambda: session.other.num_steps == 5)
+    assert session.now.num_steps == 0 and session.other.num_steps == 5
+    assert session.simulate(5, is_left=lambda: session.now.num_steps == 2)
+    assert session.now.num_steps == 2
+
+
 def test_what_was_simulated_is_not_simulated_again(opened: OpenedScene) -> None:
     one, other = Session(opened), Session(opened)
     one.simulate(3)

@@ -69,6 +69,8 @@ class ExportTab:
         self.progress.visible = True
         try:
             for step in range(last + 1):
+                if self.panel.is_left:
+                    return
                 request = self.panel.request(step)
                 frames.append(self._drawn(request) if request is not None else self._from_here(session, step))
                 self.progress.value = 100.0 * (step + 1) / (last + 1)

@@ -1,5 +1,7 @@
 """A viser server that only this machine's user can talk to: loopback, a token, no foreign page, no large upload.
 
+Values of inputs are held to the limits that their input shows, which viser leaves to the page.
+
 viser listens on all interfaces and answers any web page by default, and has no hook for either; so its one call of
 ``websockets.serve`` is wrapped while it starts (viser 1.1, pinned; ``tests/viewer/test_guard.py`` holds it to this).
 """
@@ -7,6 +9,7 @@ viser listens on all interfaces and answers any web page by default, and has no 
 import hmac
 import http
 import logging
+import math
 import secrets
 import socket
 from collections.abc import Callable, Iterator
@@ -55,7 +58,7 @@ def start_guarded_server(port: int, token: str, title: str) -> viser.ViserServer
     with _replaced(websockets.asyncio.server, "serve", guarded_serve), _replaced(rich, "print", lambda *_: None):
         server = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
     server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
-    cap_uploads(server.gui)
+    limit_messages(server.gui)
     return server
 
 
@@ -143,7 +146,52 @@ def _silent_logger() -> logging.Logger:
     return logger
 
 
-def cap_uploads(gui: Any) -> None:
+def limit_messages(gui: Any) -> None:
+    """Hold uploads to their cap and the values of inputs to their limits."""
+    _cap_uploads(gui)
+    _limit_values(gui)
+
+
+def _limit_values(gui: Any) -> None:
+    """Keep values of inputs between their limits; drop what is no number, no option, or sets anything but a value."""
+    interface = gui._websock_interface
+
+    async def update(client_id: Any, message: Any) -> None:
+        handle = gui._gui_input_handle_from_uuid.get(message.uuid)
+        if handle is None or list(message.updates) != ["value"]:
+            return
+        props = handle._impl.props
+        try:
+            value = _limited(message.updates["value"], getattr(props, "min", None), getattr(props, "max", None))
+        except (TypeError, ValueError):
+            return
+        if value not in getattr(props, "options", [value]):
+            return
+        message.updates["value"] = value
+        await gui._handle_gui_updates(client_id, message)
+
+    interface.unregister_handler(_messages.GuiUpdateMessage)
+    interface.register_handler(_messages.GuiUpdateMessage, update)
+
+
+def _limited(value: Any, low: Any, high: Any) -> Any:
+    """Return a value between limits that may be absent: for a sequence, component by component.
+
+    Raises:
+        TypeError: there are limits and no number, or the wrong number of components.
+        ValueError: a number is not finite.
+    """
+    if isinstance(value, list | tuple):
+        lows, highs = (limit if isinstance(limit, list | tuple) else [limit] * len(value) for limit in (low, high))
+        return [_limited(*each) for each in zip(value, lows, highs, strict=True)]
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError
+    if low is not None:
+        value = max(value, low)
+    return value if high is None else min(value, high)
+
+
+def _cap_uploads(gui: Any) -> None:
     """Refuse uploads of more than ``MAX_UPLOAD_BYTES``, too many at once, and parts beyond the announced size."""
     interface, pending = gui._websock_interface, gui._current_file_upload_states
 

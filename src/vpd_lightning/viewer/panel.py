@@ -116,6 +116,8 @@ class Panel(TabHost):
 
     def act(self, action: Callable[[], Any]) -> None:
         """Do what a button asks for; what cannot be done is said in the browser, and nothing else happens."""
+        if self.is_left:
+            return
         self.touched_at = time.monotonic()
         self._attempt(action)
         self.touched_at = time.monotonic()  # what took long has only just been done
@@ -141,19 +143,14 @@ class Panel(TabHost):
 
     def _simulate_once(self) -> bool:
         """Simulate; False where an edit came in between, and there is another scene to simulate."""
-        wanted, session = int(self.view_tab.length.value), self.session
+        wanted, done = int(self.view_tab.length.value), [True]
 
         def shown(_: int) -> None:
             self._allow_steps()
             self.view.film_grew()
 
-        done = [True]
-
         def simulate() -> None:
-            other = session.other
-            if other is not None:
-                other.reach(wanted)
-            done[0] = session.simulate(wanted, shown)
+            done[0] = self.session.simulate(wanted, shown, self._closed.is_set)
 
         self._attempt(simulate)
         return done[0] or self._closed.is_set()
@@ -373,6 +370,11 @@ class Panel(TabHost):
         self.screen.mode = mode
         self.view_tab.mode.value = mode
         self.redraw()
+
+    @property
+    def is_left(self) -> bool:
+        """Whether the browser is gone: what takes long ends then."""
+        return self._closed.is_set()
 
     def close(self) -> None:
         """End what runs for this client."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import viser
 
-from vpd_lightning.viewer.guard import HOST, cap_uploads, start_guarded_server
+from vpd_lightning.viewer.guard import HOST, limit_messages, start_guarded_server
 
 if TYPE_CHECKING:
     from vpd_lightning.viewer.opened_scene import OpenedScene
@@ -92,7 +92,7 @@ class Viewer:
         self.server.stop()
 
     def _welcome(self, client: Any) -> None:
-        cap_uploads(client.gui)
+        limit_messages(client.gui)
         with self._lock:
             if self._make_panel is None:
                 self._waiting[client.client_id] = client, client.gui.add_markdown(self._loading)

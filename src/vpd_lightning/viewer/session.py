@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -189,17 +190,25 @@ class Session:
 
     # Simulating
 
-    def simulate(self, num_steps: int, on_step: Callable[[int], None] | None = None) -> bool:
-        """Predict the next steps of the edited scene; False where an edit came in between."""
+    def simulate(
+        self,
+        num_steps: int,
+        on_step: Callable[[int], Any] = lambda _: None,
+        is_left: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Predict the next steps of what is shown, until nobody looks; False where an edit came in between."""
         with self.lock:
-            generation, rollout = self._generation, self.now
-        for step in range(1, num_steps + 1):
-            rollout.reach(step)
-            with self.lock:
-                if generation != self._generation:
-                    return False
-            if on_step is not None:
-                on_step(step)
+            generation, rollout, other = self._generation, self.now, self.other
+        for shown in [rollout] if other is None else [other, rollout]:
+            for step in range(1, num_steps + 1):
+                if is_left():
+                    return True
+                shown.reach(step)
+                with self.lock:
+                    if generation != self._generation:
+                        return False
+                if shown is rollout:
+                    on_step(step)
         return True
 
     # Comparing and measuring

@@ -30,6 +30,11 @@ class TabHost(ABC):
     def act(self, action: Callable[[], Any]) -> None:
         """Do what a button asks for; what cannot be done is shown in the browser."""
 
+    @property
+    @abstractmethod
+    def is_left(self) -> bool:
+        """Whether the browser is gone: what takes long ends then."""
+
     @abstractmethod
     def notify(self, title: str, text: str, color: Any = "green") -> None:
         """Show a message in the browser."""
