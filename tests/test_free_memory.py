@@ -1,13 +1,19 @@
-"""Memory that was freed leaves the process."""
+"""Memory that was freed leaves the process, and what is beyond the limit fails where it is asked for."""
 
 import ctypes
 import platform
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+import torch
 
 from vpd_lightning import free_memory
+from vpd_lightning.errors import OutOfMemoryError
+from vpd_lightning.runs.training_errors import named_memory_errors
+
+MIB = 2**20
 
 HOLES = """
 import ctypes, resource
@@ -38,3 +44,39 @@ def test_another_c_library_is_left_alone(monkeypatch: pytest.MonkeyPatch):
 
     assert not free_memory.return_free_memory()
     free_memory._malloc_trim.cache_clear()
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux says what a process held at most")
+def test_the_peak_is_what_was_held_at_most_since_it_was_reset():
+    before = free_memory.reset_peak()
+    torch.ones(100 * MIB // 4).sum()
+    assert before is not None and 95 * MIB < free_memory.peak_bytes() - before < 130 * MIB
+    again = free_memory.reset_peak()
+    assert again is not None and free_memory.peak_bytes() - again < 50 * MIB
+
+
+@pytest.mark.skipif(sys.platform != "linux" or torch.cuda.is_available(), reason="no limit is set there")
+def test_more_than_is_available_is_named_and_the_process_lives(monkeypatch: pytest.MonkeyPatch):
+    import resource
+
+    bounds = resource.getrlimit(resource.RLIMIT_DATA)
+    monkeypatch.setattr(free_memory, "available_bytes", lambda: 600 * MIB)  # 256 of these are the system's
+    for take in (lambda: torch.ones(500 * MIB // 4), lambda: bytearray(500 * MIB)):
+        with pytest.raises(OutOfMemoryError, match=r"memory ran out.\nLower renderer"), named_memory_errors():
+            take()
+    with named_memory_errors():
+        torch.ones(100 * MIB // 4)
+    assert resource.getrlimit(resource.RLIMIT_DATA) == bounds
+
+
+def test_a_container_may_allow_less_than_the_machine_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    4000 kB\n")
+    limit, used = tmp_path / "max", tmp_path / "current"
+    monkeypatch.setattr(free_memory, "_SYSTEM", tmp_path / "meminfo")
+    monkeypatch.setattr(free_memory, "_CONTAINERS", ((tmp_path / "none", used), (limit, used)))
+    for text, expected in (("max", 4000), (str(3000 * 1024), 2000), (str(500 * 1024), 0), (str(9000 * 1024), 4000)):
+        limit.write_text(text)
+        used.write_text(str(1000 * 1024))
+        assert free_memory.available_bytes() == expected * 1024
+    (tmp_path / "meminfo").unlink()
+    assert free_memory.available_bytes() is None

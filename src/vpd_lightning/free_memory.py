@@ -1,7 +1,23 @@
-"""Memory that the C library keeps although it is free."""
+"""Memory of this process: what it holds, what it may still take, and what the C library keeps although it is free."""
 
 import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
+
+import torch
+
+_PROCESS, _SYSTEM = Path("/proc/self"), Path("/proc/meminfo")
+# Limit and use of a container's memory, newer and older kernels.
+_CONTAINERS = (
+    (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
+    (
+        Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+        Path("/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+    ),
+)
+_MARGIN = 256 * 2**20  # bytes left to the system: an allocation fails before the kernel kills
 
 
 def return_free_memory() -> bool:
@@ -23,3 +39,74 @@ def _malloc_trim() -> "ctypes._NamedFuncPointer | None":
         return ctypes.CDLL(None).malloc_trim
     except (OSError, AttributeError):
         return None
+
+
+def available_bytes(device: torch.device | str = "cpu") -> int | None:
+    """Return how much more memory this process may take on a device; None where that is not known."""
+    device = torch.device(device)
+    if device.type == "cuda":
+        kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return torch.cuda.mem_get_info(device)[0] + kept
+    free = _kilobytes(_SYSTEM, "MemAvailable")
+    if free is None:
+        return None
+    for limit, used in _CONTAINERS:
+        try:
+            free = min(free, int(limit.read_text()) - int(used.read_text()))
+        except (OSError, ValueError):  # none, or "max"
+            continue
+    return max(free, 0)
+
+
+def reset_peak(device: torch.device | str = "cpu") -> int | None:
+    """Measure the largest use of memory anew; return what is used now (bytes), None where that cannot be measured."""
+    device = torch.device(device)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        return torch.cuda.memory_allocated(device)
+    return_free_memory()
+    try:
+        (_PROCESS / "clear_refs").write_text("5")
+    except OSError:
+        return None
+    return _kilobytes(_PROCESS / "status", "VmRSS")
+
+
+def peak_bytes(device: torch.device | str = "cpu") -> int | None:
+    """Return the largest use of memory (bytes) since ``reset_peak``; None where that cannot be measured."""
+    device = torch.device(device)
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return _kilobytes(_PROCESS / "status", "VmHWM")
+
+
+@contextmanager
+def limited_to_available() -> Iterator[None]:
+    """Let an allocation beyond what is available now fail with an error, instead of the system's killing the process.
+
+    Does nothing where a CUDA device is in use, whose driver reserves addresses without bounds, or outside of Linux.
+    """
+    free, held = available_bytes(), _kilobytes(_PROCESS / "status", "VmData")
+    if free is None or held is None or torch.cuda.is_available():
+        yield
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = held + max(free - _MARGIN, 0)
+    known = [bound for bound in (limit, soft, hard) if bound != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_DATA, (min(known), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def _kilobytes(path: Path, name: str) -> int | None:
+    """Return a line of the kernel's tables in bytes; None where there is none."""
+    try:
+        lines = path.read_text().splitlines()
+    except OSError:
+        return None
+    found = [line.split() for line in lines if line.startswith(f"{name}:")]
+    return int(found[0][1]) * 1024 if found else None

@@ -16,7 +16,7 @@ from vpd_lightning.data.collate import collate_clips
 from vpd_lightning.data.dataset import ClipDataset, MovingRays
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.data.manifest import load_manifest
-from vpd_lightning.data.rollout_lengths import Schedule
+from vpd_lightning.data.rollout_lengths import RolloutLengths, Schedule
 from vpd_lightning.data.sampler import StepBatchSampler, StepLoader
 from vpd_lightning.data.sensors import load_sensor
 from vpd_lightning.data.sensors.noisy_frames import NoisyFrames
@@ -95,6 +95,11 @@ class VideoDataModule(pl.LightningDataModule):
         self.trajectories: list[TrajectoryFrames] = []
         self.validation: ValidationClips | None = None
         self._medians: dict[int, tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]] = {}
+
+    @property
+    def longest_rollout(self) -> int:
+        """The most frames that a training clip has to predict."""
+        return RolloutLengths(self.num_steps, self.num_steps_schedule).longest
 
     def setup(self, stage: str = "fit") -> None:
         """Open the manifest, check every trajectory that will be used. DataError says what is wrong and what to do."""

@@ -12,6 +12,8 @@ import torch
 from lightning.pytorch import Trainer
 
 from vpd_lightning.errors import CheckpointError, ConfigError, LostProcessError, OutOfMemoryError
+from vpd_lightning.free_memory import limited_to_available
+from vpd_lightning.training.callbacks.memory_estimate import KNOBS
 
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE)
 
@@ -20,17 +22,14 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def named_memory_errors() -> Iterator[None]:
-    """Say which knobs to turn where memory ran out."""
+    """Say which knobs to turn where memory ran out: an allocation beyond what is free fails here."""
     try:
-        yield
+        with limited_to_available():
+            yield
     except (MemoryError, RuntimeError) as error:
         text = str(error).lower()
         if isinstance(error, MemoryError | torch.OutOfMemoryError) or "out of memory" in text or "alloc_cpu" in text:
-            raise OutOfMemoryError(
-                "memory ran out.\n"
-                "Lower renderer.ray_chunk_size (same result), data.batch_size, data.rays_per_step, data.num_steps or\n"
-                "encoder.num_particles; or use more devices: each takes its share of data.batch_size."
-            ) from error
+            raise OutOfMemoryError(f"memory ran out.\n{KNOBS}") from error
         raise
 
 

@@ -33,6 +33,7 @@ from vpd_lightning.runs.training_errors import (
     plain_interrupt,
 )
 from vpd_lightning.system import AbstractSystem
+from vpd_lightning.training.callbacks.memory_estimate import MemoryEstimate
 from vpd_lightning.training.callbacks.time_budget import TimeBudget
 from vpd_lightning.training.checkpoint_files import LAST
 from vpd_lightning.training.checkpoint_io import AtomicCheckpointIO
@@ -115,7 +116,7 @@ def fit(
         Trainer,
         "trainer",
         logger=build_list(config["logger"], Logger, "logger") or False,
-        callbacks=callbacks,
+        callbacks=[MemoryEstimate(force=config["force"]), *callbacks],
         plugins=[AtomicCheckpointIO(), *_cluster()],
     )
     if is_rank_zero:

@@ -19,7 +19,7 @@ from vpd_lightning.metrics.sample_metric import SampleMetric
 from vpd_lightning.metrics.true_images import TrueImages
 from vpd_lightning.system import AbstractSystem
 from vpd_lightning.training.optimization import AbstractOptimization
-from vpd_lightning.types import VideoBatch, ViewBatch
+from vpd_lightning.types import SimulatorOutput, VideoBatch, ViewBatch
 
 VALIDATION = "validation/"
 BEST_METRIC = f"{VALIDATION}{HEADLINE}"
@@ -115,10 +115,7 @@ class VPDModule(pl.LightningModule):
         """Return the weighted sum of all losses; NonFiniteError before anything is updated by a bad one."""
         self._clips = batch.clips
         self._time_step()
-        batch = batch.to(self._parameter_dtype())
-        output = self.simulator(batch)
-        parts = {loss.name: loss(output, batch) for loss in self.losses}  # type: ignore[union-attr]
-        total = torch.stack([loss.weight * parts[loss.name] for loss in self.losses]).sum()  # type: ignore[union-attr]
+        output, parts, total = self.losses_of(batch)
         if not torch.isfinite(total):
             values = ", ".join(f"{name} = {part.item()}" for name, part in parts.items())
             raise self._non_finite(f"The loss is not finite ({values})")
@@ -128,7 +125,8 @@ class VPDModule(pl.LightningModule):
             **{name: value for loss in self.losses for name, value in loss.metrics.items()},  # type: ignore[operator,union-attr]
         }
         if output.rendered is not None:
-            error = mean_squared_error(output.rendered.rgbs.detach().float(), batch.rgbs.float())
+            truth = batch.rgbs.to(self._parameter_dtype()).float()
+            error = mean_squared_error(output.rendered.rgbs.detach().float(), truth)
             self.train_metrics[PSNR] = psnr_of(error).mean()
         if self.seconds_per_step is not None:
             rays = batch.rgbs.shape[:-1].numel() * self.trainer.world_size
@@ -137,6 +135,14 @@ class VPDModule(pl.LightningModule):
         if uncovered is not None:
             self.train_metrics["uncovered_share"] = uncovered
         return total
+
+    def losses_of(self, batch: VideoBatch | ViewBatch) -> tuple[SimulatorOutput, dict[str, Tensor], Tensor]:
+        """Return what the system makes of a batch, each loss by its name, and their weighted sum."""
+        batch = batch.to(self._parameter_dtype())
+        output = self.simulator(batch)
+        parts = {loss.name: loss(output, batch) for loss in self.losses}  # type: ignore[union-attr]
+        total = torch.stack([loss.weight * parts[loss.name] for loss in self.losses]).sum()  # type: ignore[union-attr]
+        return output, parts, total
 
     def _parameter_dtype(self) -> torch.dtype:
         """Return the precision of the parameters, which the data follow (float32 under autocast, too)."""
