@@ -222,6 +222,28 @@ def test_the_best_stands_alone_only_where_no_interval_reaches_it(make_run: MakeR
     assert standing(board.main_rows, metric("penetration")) is None
 
 
+def test_the_best_of_what_no_reference_is_behind_is_said_to_be_no_better(make_run: MakeRun, tmp_path: Path):
+    make_run("a", psnr=21.0)  # between copying (20) and the mean image (22)
+    make_run("b", system="global", psnr=12.0)
+    [board] = boards(tmp_path)
+    mean = board.reference("train_mean", "psnr")
+    assert mean is not None
+
+    [line] = [line for line in winners(board) if line.startswith("- PSNR (dB): vpd")]
+
+    assert line.endswith(f"**No better than what predicts nothing: training mean ({mean.mean:.2f}).**")
+
+
+def test_the_best_that_beats_the_references_is_said_without_them(make_run: MakeRun, tmp_path: Path):
+    make_run("a", psnr=30.0)
+    make_run("b", system="global", psnr=12.0)
+    [board] = boards(tmp_path)
+
+    [line] = [line for line in winners(board) if line.startswith("- PSNR (dB): vpd")]
+
+    assert "predicts nothing" not in line
+
+
 def test_paired_differences_are_those_of_the_means(make_run: MakeRun, tmp_path: Path):
     make_run("a", psnr=30.0)
     make_run("b", system="slotformer", psnr=28.0, has_particles=False)

@@ -94,8 +94,19 @@ def winners(table: ComparisonTable) -> list[str]:
         behind = [row.system for row in told_apart(place, table.runs[0].num_bootstrap)]
         if behind:
             words += f", though on the same clips {_are(behind)} worse"
-        lines.append(words + ".")
+        lines.append(words + "." + _better_references(table, info, best))
     return lines
+
+
+def _better_references(table: ComparisonTable, info: MetricInfo, best: Estimate | None) -> str:
+    """Say where what predicts nothing is as good as the best system: being the best means nothing there."""
+    known = {TITLES[source]: found for source in REFERENCES if (found := table.reference(source, info.name))}
+    better = {title: info.shown(found.mean) for title, found in known.items()
+              if best and info.distance(found.mean) <= info.distance(best.mean)}  # fmt: skip
+    if not better:
+        return ""
+    listed = " and ".join(f"{title} ({value})" for title, value in better.items())
+    return f" **No better than what predicts nothing: {listed}.**"
 
 
 def differences_table(table: ComparisonTable) -> list[str]:
