@@ -70,13 +70,20 @@ def test_more_than_is_available_is_named_and_the_process_lives(monkeypatch: pyte
 
 
 def test_a_container_may_allow_less_than_the_machine_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    kib = 1024
     (tmp_path / "meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    4000 kB\n")
-    limit, used = tmp_path / "max", tmp_path / "current"
+    files = ("inactive_file", "active_file")
     monkeypatch.setattr(free_memory, "_SYSTEM", tmp_path / "meminfo")
-    monkeypatch.setattr(free_memory, "_CONTAINERS", ((tmp_path / "none", used), (limit, used)))
-    for text, expected in (("max", 4000), (str(3000 * 1024), 2000), (str(500 * 1024), 0), (str(9000 * 1024), 4000)):
-        limit.write_text(text)
-        used.write_text(str(1000 * 1024))
-        assert free_memory.available_bytes() == expected * 1024
+    monkeypatch.setattr(
+        free_memory, "_CONTAINERS", ((tmp_path / "none", "max", "used", files), (tmp_path, "max", "used", files))
+    )
+    for text, expected in (("max", 4000), (str(3000 * kib), 2000), (str(500 * kib), 0), (str(9000 * kib), 4000)):
+        (tmp_path / "max").write_text(f"{text}\n")
+        (tmp_path / "used").write_text(f"{1000 * kib}\n")
+        assert free_memory.available_bytes() == expected * kib
+    # Files that were read count as used, and make room where it is needed.
+    (tmp_path / "max").write_text(str(1000 * kib))
+    (tmp_path / "memory.stat").write_text(f"anon 5\ninactive_file {200 * kib}\nactive_file {300 * kib}\nfile 7\n")
+    assert free_memory.available_bytes() == 500 * kib
     (tmp_path / "meminfo").unlink()
     assert free_memory.available_bytes() is None

@@ -9,12 +9,15 @@ from pathlib import Path
 import torch
 
 _PROCESS, _SYSTEM = Path("/proc/self"), Path("/proc/meminfo")
-# Limit and use of a container's memory, newer and older kernels.
+# Limit of a container's memory, what it uses, and which part of that is files that can be read again; newer and older
+# kernels.
 _CONTAINERS = (
-    (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
+    (Path("/sys/fs/cgroup"), "memory.max", "memory.current", ("inactive_file", "active_file")),
     (
-        Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
-        Path("/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+        Path("/sys/fs/cgroup/memory"),
+        "memory.limit_in_bytes",
+        "memory.usage_in_bytes",
+        ("total_inactive_file", "total_active_file"),
     ),
 )
 _MARGIN = 256 * 2**20  # bytes left to the system: an allocation fails before the kernel kills
@@ -47,14 +50,15 @@ def available_bytes(device: torch.device | str = "cpu") -> int | None:
     if device.type == "cuda":
         kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + kept
-    free = _kilobytes(_SYSTEM, "MemAvailable")
+    free = _size(_SYSTEM, "MemAvailable")
     if free is None:
         return None
-    for limit, used in _CONTAINERS:
+    for folder, limit, used, files in _CONTAINERS:
         try:
-            free = min(free, int(limit.read_text()) - int(used.read_text()))
-        except (OSError, ValueError):  # none, or "max"
+            left = int((folder / limit).read_text()) - int((folder / used).read_text())
+        except (OSError, ValueError):  # no container, or "max"
             continue
+        free = min(free, left + sum(_size(folder / "memory.stat", name) or 0 for name in files))
     return max(free, 0)
 
 
@@ -69,7 +73,7 @@ def reset_peak(device: torch.device | str = "cpu") -> int | None:
         (_PROCESS / "clear_refs").write_text("5")
     except OSError:
         return None
-    return _kilobytes(_PROCESS / "status", "VmRSS")
+    return _size(_PROCESS / "status", "VmRSS")
 
 
 def peak_bytes(device: torch.device | str = "cpu") -> int | None:
@@ -77,7 +81,7 @@ def peak_bytes(device: torch.device | str = "cpu") -> int | None:
     device = torch.device(device)
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
-    return _kilobytes(_PROCESS / "status", "VmHWM")
+    return _size(_PROCESS / "status", "VmHWM")
 
 
 @contextmanager
@@ -86,7 +90,7 @@ def limited_to_available() -> Iterator[None]:
 
     Does nothing where a CUDA device is in use, whose driver reserves addresses without bounds, or outside of Linux.
     """
-    free, held = available_bytes(), _kilobytes(_PROCESS / "status", "VmData")
+    free, held = available_bytes(), _size(_PROCESS / "status", "VmData")
     if free is None or held is None or torch.cuda.is_available():
         yield
         return
@@ -102,11 +106,11 @@ def limited_to_available() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
-def _kilobytes(path: Path, name: str) -> int | None:
-    """Return a line of the kernel's tables in bytes; None where there is none."""
+def _size(path: Path, name: str) -> int | None:
+    """Return a line of the kernel's tables (``Name: 12 kB`` or ``name 12288``) in bytes; None where there is none."""
     try:
         lines = path.read_text().splitlines()
     except OSError:
         return None
-    found = [line.split() for line in lines if line.startswith(f"{name}:")]
-    return int(found[0][1]) * 1024 if found else None
+    found = [line.split() for line in lines if line.split()[:1] in ([name], [f"{name}:"])]
+    return int(found[0][1]) * (1024 if found[0][2:] == ["kB"] else 1) if found else None
