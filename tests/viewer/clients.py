@@ -1,6 +1,9 @@
 """Browsers that are none: they say where their camera is, and read what the server sends."""
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -9,6 +12,7 @@ from viser import _messages
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from tests.viewer.opened import open_tossed_box
 from tests.waiting import HANG, wait_until
 from vpd_lightning.viewer.panel import Panel
 from vpd_lightning.viewer.server import Viewer
@@ -50,3 +54,17 @@ def camera_message(position: tuple[float, float, float] = (0.0, 0.0, 3.0)) -> by
 
 def serialized(message: Any) -> bytes:
     return msgspec.msgpack.encode(message.as_serializable_dict())
+
+
+@contextmanager
+def only_page(folder: Path) -> Iterator[tuple[Panel, Any]]:
+    """Yield the panel and the connection of the one page of a viewer of its own, which shows a tossed box."""
+    viewer = Viewer(0, "a-token-for-tests")
+    try:
+        viewer.show(open_tossed_box(folder), folder / "view", 3)
+        with socket_of(viewer, "?token=a-token-for-tests") as connection:
+            connection.send(camera_message())
+            drain(connection)
+            yield settled_panel(viewer, set()), connection
+    finally:
+        viewer.stop()
