@@ -17,6 +17,7 @@ from data_gen.inspection.fault import Fault
 from data_gen.inspection.free_space import MAX_SHARE, FreeSpace, free_space_violations
 from data_gen.inspection.pose_agreement import MAX_MISPLACED, Misplacement, misplacements, outlier_view
 from data_gen.inspection.posed_depth import PosedDepth
+from data_gen.inspection.trigger_delay import MAX_DELAY, TriggerDelay, trigger_delays
 from data_gen.inspection.view_agreement import MAX_PAIRS, Agreement, compare_views
 from vpd_lightning.data import schema
 from vpd_lightning.data.ground_truth import has_state, read_state
@@ -73,7 +74,9 @@ def check_dataset(path: str | Path) -> Report:
     if path.is_file():
         faults = validate_trajectory(path)
         compared = [_check_views(path)] if _is_comparable(faults) else []
-        return Report([*faults, *(fault for item in compared for fault in item.faults)], _summary(path, compared))
+        faults += [fault for item in compared for fault in item.faults]
+        delays = _delays([path] if compared else [], faults)
+        return Report(faults + _judge_delays(path, path, delays), _summary(path, compared, delays))
     faults = []
     try:
         manifest = load_manifest(path)
@@ -105,7 +108,10 @@ def check_dataset(path: str | Path) -> Report:
     for item in compared:
         said = {(fault.name, fault.message) for fault in faults if not fault.is_error}
         faults += [fault for fault in item.faults if fault.is_error or (fault.name, fault.message) not in said]
-    return Report(faults, _summary(path, compared))
+    delays = _delays(chosen, faults)
+    if delays:
+        faults += _judge_delays(path, chosen[0], delays)
+    return Report(faults, _summary(path, compared, delays))
 
 
 def validate_trajectory(path: Path) -> list[Fault]:
@@ -219,6 +225,27 @@ def _judge_poses(path: Path, found: Sequence[Misplacement]) -> list[Fault]:
     return [Fault("pose_off", str(path), message)]
 
 
+def _delays(paths: list[Path], faults: list[Fault]) -> list[TriggerDelay]:
+    """How late each view is; not asked where something else is wrong, which could look like it."""
+    return [] if any(fault.is_error for fault in faults) else trigger_delays(paths)
+
+
+def _judge_delays(path: Path, file: Path, delays: list[TriggerDelay]) -> list[Fault]:
+    certain = [item for item in delays if item.is_certain]
+    if not certain:
+        return []
+    worst = max(certain, key=lambda item: abs(item.delay))
+    with TrajectoryReader(file) as reader:
+        name, *others = (reader.view_label(view) for view in (worst.view, *worst.others))
+    message = (
+        f"view {name} is taken {1e3 * abs(worst.delay):.3g} ms (standard error {1e3 * worst.error:.1g} ms) "
+        f"{'later' if worst.delay > 0 else 'earlier'} than view{'s' if len(others) > 1 else ''} {', '.join(others)}, "
+        f"as what moves tells; allowed is {MAX_DELAY:.0%} of the {1e3 * worst.frame_time:.3g} ms between frames. "
+        "Trigger the cameras together, or pair its frames with those of the others by their time stamps"
+    )
+    return [Fault("trigger_delay", str(path), message)]
+
+
 def _judge_free_space(path: Path, free_space: FreeSpace) -> Fault:
     message = (
         f"{free_space.share:.1%} of {free_space.num_points} points lie in front of what another view sees there "
@@ -234,7 +261,7 @@ def _judge_free_space(path: Path, free_space: FreeSpace) -> Fault:
     return Fault("free_space", str(path), message + worst)
 
 
-def _summary(path: Path, compared: list[_Views]) -> str:
+def _summary(path: Path, compared: list[_Views], delays: Sequence[TriggerDelay] = ()) -> str:
     agreements = [item.agreement for item in compared if item.agreement is not None]
     distances = [agreement.distance for agreement in agreements if np.isfinite(agreement.distance)]
     parts = ["no views compared"]
@@ -245,6 +272,9 @@ def _summary(path: Path, compared: list[_Views]) -> str:
     if num_points:
         share = sum(item.free_space.share * item.free_space.num_points for item in compared) / num_points
         parts.append(f"free-space violations {_percent(share)} of {num_points} points")
+    if delays:
+        worst = max(delays, key=lambda item: abs(item.delay))
+        parts.append(f"views taken within {1e3 * abs(worst.delay):.1f} +- {1e3 * worst.error:.1f} ms of each other")
     return f"{path}: {len(compared)} {'file' if len(compared) == 1 else 'files'} compared, " + ", ".join(parts)
 
 
