@@ -31,10 +31,12 @@ def simulate_and_render(
     clock: StageClock,
     check_stop: Callable[[], None],
     observe: Callable[[int], None],
+    step: Callable[[int], None] | None = None,
 ) -> RenderedTrajectory:
     """Simulate and draw ``settings.num_frames`` frames from the state that ``data`` holds.
 
     ``check_stop`` is called before each frame and may raise; ``observe(frame)`` sees ``data`` as the frame shows it.
+    ``step(frame)`` simulates up to a frame from the one before where something is driven on the way.
     """
     import mujoco
 
@@ -46,7 +48,9 @@ def simulate_and_render(
     for frame in range(settings.num_frames):
         check_stop()
         with clock.measure("simulate"):
-            if frame:
+            if frame and step is not None:
+                step(frame)
+            elif frame:
                 mujoco.mj_step(model, data, settings.substeps)
             mujoco.mj_forward(model, data)  # poses of this very moment, not of one physics step ago
             observe(frame)
@@ -64,6 +68,7 @@ def trajectory_of(
     engine: str,
     scene_hash: str,
     attributes: Mapping[str, Any],
+    action: Mapping[str, NDArray[Any]] | None = None,
 ) -> schema.Trajectory:
     """Return what the file of a generated trajectory holds; the rendered segmentation joins ``state``."""
     return schema.Trajectory(
@@ -80,5 +85,6 @@ def trajectory_of(
         engine=engine,
         scene_hash=scene_hash,
         attributes=attributes,
+        action=action,
         state={**state, schema.STATE_SEGMENTATION: pictures.segmentation},
     )

@@ -1,9 +1,11 @@
 """A generated trajectory as a simulated sensor would have recorded it; the truth moves to the ground truth."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_gen.scene_settings import SceneSettings
 from vpd_lightning.data import schema
@@ -13,7 +15,8 @@ from vpd_lightning.errors import ConfigError
 
 _OVER_TIME = (
     schema.STATE_POSITIONS, schema.STATE_QUATERNIONS, schema.STATE_LINEAR_VELOCITIES, schema.STATE_ANGULAR_VELOCITIES,
-    schema.STATE_SEGMENTATION, schema.STATE_VERTICES,
+    schema.STATE_SEGMENTATION, schema.STATE_VERTICES, schema.ACTION_POINTS, schema.ACTION_NORMALS, schema.ACTION_POSES,
+    schema.ACTION_COMMANDED_POSES,
 )  # fmt: skip
 
 
@@ -66,6 +69,18 @@ def measured(
             )
             rgb[frame, view] = errors.measure_rgb(trajectory.rgb[drawn, view], frame, view)
     frames = slice(0, (settings.num_frames - 1) * stride + 1, stride)
-    state = {key: value[frames] if key in _OVER_TIME else value for key, value in (trajectory.state or {}).items()}
+    state = _chosen(trajectory.state or {}, frames)
     state |= {schema.STATE_DEPTH: trajectory.depth[frames], schema.STATE_CAM_TO_WORLD: trajectory.cam_to_world}
-    return replace(trajectory, rgb=rgb, depth=depth, cam_to_world=poses, frame_time=settings.frame_time, state=state)
+    return replace(
+        trajectory,
+        rgb=rgb,
+        depth=depth,
+        cam_to_world=poses,
+        frame_time=settings.frame_time,
+        state=state,
+        action=None if trajectory.action is None else _chosen(trajectory.action, frames),
+    )
+
+
+def _chosen(arrays: Mapping[str, NDArray[Any]], frames: slice) -> dict[str, NDArray[Any]]:
+    return {key: value[frames] if key in _OVER_TIME else value for key, value in arrays.items()}

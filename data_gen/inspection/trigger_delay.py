@@ -51,6 +51,11 @@ class TriggerDelay:
     frame_time: float
 
     @property
+    def is_known(self) -> bool:
+        """Whether a fifth of a frame would show."""
+        return _SURE * self.error < MAX_DELAY * self.frame_time
+
+    @property
     def is_certain(self) -> bool:
         """Whether it is surely more than a fifth of a frame."""
         return abs(self.delay) > MAX_DELAY * self.frame_time + _SURE * self.error

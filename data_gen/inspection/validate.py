@@ -20,6 +20,7 @@ from data_gen.inspection.posed_depth import PosedDepth
 from data_gen.inspection.trigger_delay import MAX_DELAY, TriggerDelay, trigger_delays
 from data_gen.inspection.view_agreement import MAX_PAIRS, Agreement, compare_views
 from vpd_lightning.data import schema
+from vpd_lightning.data.driven import read_driven
 from vpd_lightning.data.ground_truth import has_state, read_state
 from vpd_lightning.data.hdf5.broken_file import BrokenFileError
 from vpd_lightning.data.hdf5.checks import open_file
@@ -128,6 +129,7 @@ def validate_trajectory(path: Path) -> list[Fault]:
             if is_measured and not is_inside:
                 faults.append(Fault("empty_workspace", str(path), _empty_workspace(reader)))
             faults += _check_state(path, reader)
+            read_driven(path)
     except DataError as error:
         kind = error.kind if isinstance(error, BrokenFileError) else "unreadable"
         return [Fault(kind, str(path), _one_line(error, str(path)))]
@@ -272,7 +274,7 @@ def _summary(path: Path, compared: list[_Views], delays: Sequence[TriggerDelay] 
     if num_points:
         share = sum(item.free_space.share * item.free_space.num_points for item in compared) / num_points
         parts.append(f"free-space violations {_percent(share)} of {num_points} points")
-    if delays:
+    if delays and all(item.is_known for item in delays):
         worst = max(delays, key=lambda item: abs(item.delay))
         parts.append(f"views taken within {1e3 * abs(worst.delay):.1f} +- {1e3 * worst.error:.1f} ms of each other")
     return f"{path}: {len(compared)} {'file' if len(compared) == 1 else 'files'} compared, " + ", ".join(parts)

@@ -198,11 +198,12 @@ class TrajectoryReader:
     def _check(self, file: h5py.File) -> None:
         path = self.path
         version = checked_attribute(path, file, "schema_version", "integer")
-        if version != schema.SCHEMA_VERSION:
+        if version not in schema.SCHEMA_VERSIONS:
+            known = " and ".join(map(str, schema.SCHEMA_VERSIONS))
             raise refuse(
                 path,
                 "schema_version",
-                f"has schema version {version}; this program reads version {schema.SCHEMA_VERSION}",
+                f"has schema version {version}; this program reads versions {known}",
             )
         depth_type = checked_attribute(path, file, "depth_type", "text")
         if depth_type != schema.DEPTH_TYPE:

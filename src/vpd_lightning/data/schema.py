@@ -1,4 +1,6 @@
-"""The HDF5 file of one trajectory, schema version 1: names, shapes, dtypes, and an atomic writer.
+"""The HDF5 file of one trajectory: names, shapes, dtypes, and an atomic writer.
+
+Schema version 1, or 2 with ``action/``: files without actions are the same in both.
 
 Readable with h5py alone::
 
@@ -7,6 +9,7 @@ Readable with h5py alone::
                                                 (or uint16 with attributes ``scale`` and ``offset``)
     intrinsics   (view, 3, 3) or (time, view, 3, 3) float64    pixels, pixel centres at +0.5
     cam_to_world (view, 4, 4) or (time, view, 4, 4) float64    OpenCV camera axes, metres
+    action/      optional motion that is given, such as a robot's (see ``data.driven``)
     state/       optional ground truth, for evaluation only (see ``data.ground_truth``)
     attributes   schema_version, frame_time (s), near, far (m along the ray), workspace_min, workspace_max (m),
                  depth_type = "z", source_depth_type, seed, engine, scene_hash; recordings: view_names (a JSON list)
@@ -24,15 +27,24 @@ from numpy.typing import NDArray
 from vpd_lightning.files import AtomicPath
 
 SCHEMA_VERSION = 1
+SCHEMA_VERSION_WITH_ACTION = 2
+SCHEMA_VERSIONS = (SCHEMA_VERSION, SCHEMA_VERSION_WITH_ACTION)  # that can be read
 DEPTH_TYPE = "z"
 RGB, DEPTH, INTRINSICS, CAM_TO_WORLD, STATE = "rgb", "depth", "intrinsics", "cam_to_world", "state"
 VIEW_NAMES = "view_names"
+ACTION = "action"
+ACTION_POINTS = "points"  # (time, particle, 3) float32 m, world: on the surface of what is driven, the same ones always
+ACTION_NORMALS = "normals"  # (time, particle, 3) float32, world, outward, of unit length
+ACTION_GROUPS = "groups"  # (particle,) int32, the rigid part (link) that each point belongs to, from 0
+ACTION_POSES = "poses"  # optional (time, group, 4, 4) float64: part to world, as measured
+ACTION_COMMANDED_POSES = "commanded_poses"  # optional, the same: where the controller was asked to bring it
 STATE_POSITIONS = "positions"  # (time, object, 3) m, world
 STATE_QUATERNIONS = "quaternions"  # (time, object, 4) w x y z, body to world
 STATE_LINEAR_VELOCITIES = "linear_velocities"  # (time, object, 3) m/s, world, of the centre of mass
 STATE_ANGULAR_VELOCITIES = "angular_velocities"  # (time, object, 3) rad/s, world
 STATE_HALF_SIZES = "half_sizes"  # (object, 3) m, along the body's own axes
-STATE_SEGMENTATION = "segmentation"  # (time, view, height, width) uint8, 0 background, i + 1 object i
+STATE_SEGMENTATION = "segmentation"  # (time, view, height, width) uint8, 0 background, i + 1 object i, 255 driven
+DRIVEN_LABEL = 255
 STATE_DEPTH = "depth"  # (time, view, height, width) float32 m: without the errors of a simulated sensor
 STATE_CAM_TO_WORLD = "cam_to_world"  # (view, 4, 4) float64: as above
 STATE_VERTICES = "vertices"  # (time, vertex, 3) float32 m, world: soft bodies, all of them one after another
@@ -64,6 +76,7 @@ class Trajectory:
     engine: str = ""
     scene_hash: str = ""
     state: Mapping[str, NDArray[Any]] | None = None
+    action: Mapping[str, NDArray[Any]] | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -105,6 +118,10 @@ def write_trajectory(
             _write_images(file, DEPTH, trajectory.depth, compression)
         file.create_dataset(INTRINSICS, data=trajectory.intrinsics)
         file.create_dataset(CAM_TO_WORLD, data=trajectory.cam_to_world)
+        if trajectory.action is not None:
+            group = file.create_group(ACTION)
+            for name, values in trajectory.action.items():
+                group.create_dataset(name, data=values)
         if trajectory.state is not None:
             group = file.create_group(STATE)
             for name, values in trajectory.state.items():
@@ -135,7 +152,8 @@ def decode_depth(codes: NDArray[np.uint16], scale: float, offset: float) -> NDAr
 
 
 def _write_attributes(file: h5py.File, trajectory: Trajectory) -> None:
-    file.attrs["schema_version"] = SCHEMA_VERSION
+    has_action = trajectory.action is not None
+    file.attrs["schema_version"] = SCHEMA_VERSION_WITH_ACTION if has_action else SCHEMA_VERSION
     file.attrs["depth_type"] = DEPTH_TYPE
     for name in ("frame_time", "near", "far", "seed", "source_depth_type", "engine", "scene_hash"):
         file.attrs[name] = getattr(trajectory, name)
