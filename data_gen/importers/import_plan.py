@@ -140,6 +140,7 @@ def clip_trajectory(
         source_depth_type=recording.source.get("depth_type", "z"),
         engine=f"imported from {plan.format}",
         scene_hash=scene_hash,
+        action=None if recording.driven is None else plan.frame.driven(recording.driven.at(kept)).as_arrays(),
         attributes=_attributes(plan, clip),
     )
 

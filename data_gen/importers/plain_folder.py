@@ -5,6 +5,7 @@ A recording is one folder; a folder of such folders is several recordings, each 
     my_recordings/
       first_take/
         cameras.json
+        action.npz                                   optional: what a robot did (see ``plain_action``)
         left/rgb/000000.png      000001.png ...      8-bit PNG or JPEG, one size for all views
         left/depth/000000.png    000001.png ...      16-bit PNG or TIFF, or metres as float .npy or TIFF
         right/rgb/...
@@ -66,6 +67,7 @@ from data_gen.importers.conventions import (
 )
 from data_gen.importers.depth_registration import DepthCamera
 from data_gen.importers.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, depth_size, image_size, read_color, read_depth
+from data_gen.importers.plain_action import ACTION_FILE, read_action
 from data_gen.importers.plain_cameras import (
     PIXEL_CENTERS,
     depth_camera,
@@ -167,6 +169,7 @@ def _recording(folder: Path, settings: ImportSettings) -> Recording:
         distortion=_distortions(views),
         view_names=[entry["name"] for entry in listed],
         depth_cameras=[view.depth_camera for view in views],
+        driven=read_action(folder / ACTION_FILE, len(views[0].color)),
         split=choice(content, "split", str(file), dict.fromkeys(SPLITS, "")) if "split" in content else None,
     )
 

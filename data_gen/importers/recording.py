@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.importers.depth_registration import DepthCamera
+from vpd_lightning.data.driven import DrivenMotion
 from vpd_lightning.data.manifest import SPLITS
 
 MIN_FRAMES = 3  # two observed frames and one to predict
@@ -36,6 +37,7 @@ class Recording:
         split: ``train``, ``validation`` or ``test`` where the source says so.
         view_names: what the source calls its views; empty where they have no names.
         depth_cameras: one for each view, ``None`` where depth is aligned to colour; empty where all of it is.
+        driven: what a robot did, in the source's world, one entry for each frame; ``None`` where nothing says so.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Recording:
     split: str | None = None
     view_names: Sequence[str] = ()
     depth_cameras: Sequence[DepthCamera | None] = ()
+    driven: DrivenMotion | None = None
 
     def __post_init__(self) -> None:
         time, view = self.num_frames, self.num_views

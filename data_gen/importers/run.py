@@ -129,6 +129,7 @@ def _identity(plan: ImportPlan) -> dict[str, Any]:
         recording = plan.sources[clip.recording.name]  # as given: refined poses differ in their last digits by machine
         arrays = [recording.intrinsics, recording.cam_to_world, recording.distortion]
         arrays += [array for camera in recording.depth_cameras if camera is not None for array in camera.arrays()]
+        arrays += [] if recording.driven is None else list(recording.driven.as_arrays().values())
         facts = (recording.name, recording.height, recording.width, recording.num_frames, recording.frame_time)
         digest.update(repr((facts, sorted(recording.source.items()), clip.path.as_posix(), clip.frames)).encode())
         for array in arrays:

@@ -4,7 +4,7 @@ Unlike ground truth, it is an input: who simulates an action knows it beforehand
 forward kinematics.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,17 @@ class DrivenMotion:
     def num_groups(self) -> int:
         return int(self.groups.max()) + 1
 
+    def at(self, frames: Sequence[int]) -> "DrivenMotion":
+        """Return the motion of some frames."""
+        chosen = list(frames)
+        return DrivenMotion(
+            points=self.points[chosen],
+            normals=self.normals[chosen],
+            groups=self.groups,
+            poses=None if self.poses is None else self.poses[chosen],
+            commanded_poses=None if self.commanded_poses is None else self.commanded_poses[chosen],
+        )
+
     def as_arrays(self) -> dict[str, NDArray[Any]]:
         """Return what ``action/`` of a file holds."""
         arrays = {name: getattr(self, name) for name in (*_LAYOUT, *_POSES)}
@@ -72,11 +83,16 @@ def read_driven(path: str | Path) -> DrivenMotion | None:
         }
         num_frames = file[schema.RGB].shape[0]
     driven = DrivenMotion(**arrays)
-    _check(path, driven, num_frames)
+    check_driven(path, driven, num_frames)
     return driven
 
 
-def _check(path: Path, driven: DrivenMotion, num_frames: int) -> None:
+def check_driven(path: Path, driven: DrivenMotion, num_frames: int) -> None:
+    """Refuse arrays that do not fit each other or the number of frames, or that are no points and rotations.
+
+    Raises:
+        DataError: naming the file and the fault.
+    """
     num_points = driven.points.shape[1]
     for name in (schema.ACTION_POINTS, schema.ACTION_NORMALS):
         shape = getattr(driven, name).shape
