@@ -20,6 +20,14 @@ LeRobot has no standard names for camera matrices, so a YAML file names them: ``
         # distortion: [k1, k2, p1, p2, k3]
       - name: wrist
         ...
+    robot:                                            # optional: its links become points whose motion is given
+      model: arm.xml                                  # MJCF or URDF, beside the mapping
+      state: observation.state                        # joint positions: metres of sliding joints, else ``unit``
+      joints: [shoulder, elbow, null]                 # the model's joint of each number; null: a number that is none
+      unit: rad                                       # rad | deg
+      # command: action                               # joint positions that were asked for
+      # base: [[...], [...], [...], [0, 0, 0, 1]]     # 4x4, the model's world to the cameras'; the same without
+      # points: 256                                   # on its surface
 
 Each episode becomes a recording. ManiSkill's exports have ``extrinsic_cv`` (world to camera, OpenCV axes),
 ``cam2world_gl`` and ``intrinsic_cv``. In depth videos the first and the last code count as no measurement: they also
@@ -48,7 +56,7 @@ from data_gen.importers.conventions import (
     shift_principal_point,
 )
 from data_gen.importers.images import depth_in_metres
-from data_gen.importers.lerobot_mapping import MappedView, read_lerobot_mapping
+from data_gen.importers.lerobot_mapping import LeRobotMapping, MappedView, read_lerobot_mapping
 from data_gen.importers.lerobot_tables import Episode, LeRobotFolder
 from data_gen.importers.recording import Recording
 from data_gen.importers.settings import ImportSettings, chosen
@@ -72,9 +80,11 @@ def recordings(path: Path, settings: ImportSettings) -> Iterator[Recording]:
         ConfigError: the mapping is missing or does not fit, or pyarrow or PyAV are not installed.
         DataError: the data set is of another version, or broken.
     """
-    views = read_lerobot_mapping(settings.mapping)
+    mapping = read_lerobot_mapping(settings.mapping)
     folder = LeRobotFolder(path)
-    for view in views:
+    for name in mapping.robot.features if mapping.robot is not None else ():
+        folder.feature(name, "mapping, robot")
+    for view in mapping.views:
         for kind, name in (("rgb", view.rgb), ("depth", view.depth)):
             if folder.feature(name, f"mapping, view {view.name}: {kind}")["dtype"] == "video":
                 import_av()
@@ -83,17 +93,19 @@ def recordings(path: Path, settings: ImportSettings) -> Iterator[Recording]:
                 folder.feature(value, f"mapping, view {view.name}")
     videos = VideoCache()
     for episode in folder.episodes():
-        yield _recording(folder, episode, views, videos, settings)
+        yield _recording(folder, episode, mapping, videos, settings)
 
 
 def _recording(
-    folder: LeRobotFolder, episode: Episode, views: Sequence[MappedView], videos: VideoCache, settings: ImportSettings
+    folder: LeRobotFolder, episode: Episode, mapping: LeRobotMapping, videos: VideoCache, settings: ImportSettings
 ) -> Recording:
+    views, robot = mapping.views, mapping.robot
     height, width = _common_size(folder, views)
     centers = [float(chosen(settings.pixel_center, str(view.pixel_center))) for view in views]
     axes = [chosen(settings.axes, view.axes) for view in views]
     types = [chosen(settings.depth, view.depth_type) for view in views]
-    numbers = folder.numbers(episode, [x for v in views for x in (v.intrinsics, v.pose) if isinstance(x, str)])
+    names = [x for view in views for x in (view.intrinsics, view.pose) if isinstance(x, str)]
+    numbers = folder.numbers(episode, [*names, *(robot.features if robot is not None else ())])
     intrinsics = join_views(
         [
             shift_principal_point(_intrinsics(view, numbers, episode), 0.5 - center)
@@ -134,6 +146,7 @@ def _recording(
         },
         view_names=[view.name for view in views],
         distortion=distortion,
+        driven=None if robot is None else robot.motion(numbers, str(episode)),
         split=episode.split,
     )
 

@@ -10,6 +10,7 @@ import yaml
 from numpy.typing import NDArray
 
 from data_gen.importers.conventions import camera_matrix, checked_intrinsics, checked_pose
+from data_gen.importers.lerobot_robot import MappedRobot, read_robot
 from data_gen.importers.source_files import choice, number
 from data_gen.settings import did_you_mean
 from vpd_lightning.errors import ConfigError, DataError
@@ -98,7 +99,15 @@ class MappedView:
         return DepthCodes(low, high, is_log, shift)
 
 
-def read_lerobot_mapping(file: str | None) -> list[MappedView]:
+@dataclass(frozen=True)
+class LeRobotMapping:
+    """What the features of a data set are; ``robot`` is None where the mapping names none."""
+
+    views: list[MappedView]
+    robot: MappedRobot | None
+
+
+def read_lerobot_mapping(file: str | None) -> LeRobotMapping:
     """Read the YAML file named by the setting ``mapping``.
 
     Raises:
@@ -124,9 +133,10 @@ def read_lerobot_mapping(file: str | None) -> list[MappedView]:
             f"{path}: 'views' must be a list of cameras, each with name, rgb, depth, intrinsics, a pose ..."
         )
     try:
-        return [_view(entry, f"{path}: view {entry.get('name', index)}") for index, entry in enumerate(views)]
+        mapped = [_view(entry, f"{path}: view {entry.get('name', index)}") for index, entry in enumerate(views)]
     except DataError as error:  # the mapping is a setting, not data
         raise ConfigError(str(error)) from error
+    return LeRobotMapping(mapped, read_robot(content["robot"], path) if "robot" in content else None)
 
 
 def _view(entry: dict[str, Any], where: str) -> MappedView:
