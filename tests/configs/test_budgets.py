@@ -9,7 +9,7 @@ from data_gen.settings import load_preset
 from vpd_lightning.config import build_simulator, check_targets, check_widths, compose, config_folder
 
 EXPERIMENTS = sorted(path.stem for path in (config_folder() / "experiment").glob("*.yaml"))
-OF_THE_PAPER = [name for name in EXPERIMENTS if name not in ("tiny", "demo", "recordings")]
+OF_THE_PAPER = [name for name in EXPERIMENTS if name not in ("tiny", "demo", "recordings", "pushing")]
 SECTIONS = ("model", "data", "encoder", "dynamics", "renderer", "loss", "optimizer", "trainer", "callbacks", "logger")
 STAGES = {"encoder": "unet_small", "dynamics": "hierarchical_gnn_small", "renderer": "point_nerf_small"}
 
