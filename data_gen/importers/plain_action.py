@@ -15,6 +15,7 @@ and, with either, ``poses`` and ``commanded_poses`` (time, link, 4, 4): measured
 """
 
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -58,29 +59,25 @@ def read_action(path: Path, num_frames: int) -> DrivenMotion | None:
         raise DataError(f"{path} needs {_FORMS}; it holds {', '.join(arrays) or 'nothing'}.")
     num_points = arrays[needed[0]].shape[0 if is_links else 1] if arrays[needed[0]].ndim > 1 else 0
     groups = arrays.get(ACTION_GROUPS, np.zeros(num_points, np.int32)).astype(np.int32)
-    points, normals = _carried(path, arrays, groups) if is_links else (arrays[ACTION_POINTS], arrays[ACTION_NORMALS])
     poses, commanded = (
         arrays[name].astype(np.float64) if name in arrays else None for name in (ACTION_POSES, ACTION_COMMANDED_POSES)
     )
-    driven = DrivenMotion(points.astype(np.float32), normals.astype(np.float32), groups, poses, commanded)
+    if is_links and poses is not None:
+        _check_links(path, arrays, groups)
+        driven = DrivenMotion.carried(arrays[_LINK_POINTS], arrays[_LINK_NORMALS], groups, poses, commanded)
+    else:
+        points, normals = (arrays[name].astype(np.float32) for name in (ACTION_POINTS, ACTION_NORMALS))
+        driven = DrivenMotion(points, normals, groups, poses, commanded)
     if driven.points.ndim != 3 or not num_points or groups.shape != (num_points,):
         raise DataError(f"{path}: {needed[0]} has shape {arrays[needed[0]].shape}, groups {groups.shape}: {_FORMS}.")
     check_driven(path, driven, num_frames)
     return driven
 
 
-def _carried(
-    path: Path, arrays: dict[str, NDArray[np.generic]], groups: NDArray[np.int32]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Move each link's points and normals with it."""
-    points, normals, poses = (
-        np.asarray(arrays[name], np.float64) for name in (_LINK_POINTS, _LINK_NORMALS, ACTION_POSES)
-    )
+def _check_links(path: Path, arrays: dict[str, NDArray[Any]], groups: NDArray[np.int32]) -> None:
+    points, normals, poses = (arrays[name] for name in (_LINK_POINTS, _LINK_NORMALS, ACTION_POSES))
     fits = points.ndim == 2 and points.shape[1:] == (3,) and normals.shape == points.shape
     fits = fits and groups.shape == points.shape[:1] and poses.ndim == 4 and poses.shape[2:] == (4, 4)
     if not fits or not 0 <= groups.min() <= groups.max() < poses.shape[1]:
         shapes = ", ".join(f"{name} {values.shape}" for name, values in arrays.items())
         raise DataError(f"{path}: {shapes} do not fit each other: {_FORMS}; groups are numbers of links.")
-    carrying = poses[:, groups]
-    turned = np.einsum("tpij,pj->tpi", carrying[..., :3, :3], points)
-    return turned + carrying[..., :3, 3], np.einsum("tpij,pj->tpi", carrying[..., :3, :3], normals)

@@ -94,16 +94,7 @@ class RobotModel:
 
     def motion(self, poses: Array, commanded_poses: Array | None = None) -> DrivenMotion:
         """Carry the points along poses (time, link, 4, 4)."""
-        carrying = poses[:, self.groups]
-        turned = np.einsum("tpij,pj->tpi", carrying[..., :3, :3], self.points)
-        normals = np.einsum("tpij,pj->tpi", carrying[..., :3, :3], self.normals)
-        return DrivenMotion(
-            (turned + carrying[..., :3, 3]).astype(np.float32),
-            normals.astype(np.float32),
-            self.groups,
-            poses,
-            commanded_poses,
-        )
+        return DrivenMotion.carried(self.points, self.normals, self.groups, poses, commanded_poses)
 
 
 def load_robot(path: Path, num_points: int) -> RobotModel:

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from data_gen.inspection.free_space import depth_noise
 from data_gen.inspection.posed_depth import Array, PosedDepth, angle_between, rays
-from vpd_lightning.data.reader import TrajectoryReader
+from vpd_lightning.data.reader import MAX_FRAMES, TrajectoryReader
 
 MAX_DELAY = 0.2
 """Share of the time between frames by which a view may be late."""
@@ -120,7 +120,7 @@ def _changes(reader: TrajectoryReader, number: int) -> dict[tuple[int, int], _Ch
                 depth[window, other],
                 nearer[window, other],
             )
-            parts.append(_Changes(differences, changes, np.full(len(changes), number * reader.num_frames + middle)))
+            parts.append(_Changes(differences, changes, np.full(len(changes), number * MAX_FRAMES + middle)))
         found[views[one], views[other]] = _joined(parts)
     return found
 

@@ -142,14 +142,8 @@ class Pushing:
     def driven_motion(self) -> DrivenMotion:
         """Return points on the pusher's surface as it moved."""
         points, normals = cylinder_surface(self.settings.pusher)
-        moved = points + self._measured[:, 0, None, :3, 3]
-        return DrivenMotion(
-            points=moved.astype(np.float32),
-            normals=np.broadcast_to(normals, moved.shape).astype(np.float32),
-            groups=np.zeros(len(points), np.int32),
-            poses=self._measured,
-            commanded_poses=self._commanded,
-        )
+        groups = np.zeros(len(points), np.int32)
+        return DrivenMotion.carried(points, normals, groups, self._measured, self._commanded)
 
 
 def cylinder_surface(pusher: PusherSettings) -> tuple[NDArray[Any], NDArray[Any]]:

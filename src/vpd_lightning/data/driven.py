@@ -45,6 +45,21 @@ class DrivenMotion:
     def num_groups(self) -> int:
         return int(self.groups.max()) + 1
 
+    @classmethod
+    def carried(
+        cls,
+        points: NDArray[np.floating],
+        normals: NDArray[np.floating],
+        groups: NDArray[np.int32],
+        poses: NDArray[np.float64],
+        commanded_poses: NDArray[np.float64] | None = None,
+    ) -> "DrivenMotion":
+        """Return points and normals (particle, 3), each in its part's own frame, moved along ``poses``."""
+        carrying = poses[:, groups]
+        turned, facing = (np.einsum("tpij,pj->tpi", carrying[..., :3, :3], part) for part in (points, normals))
+        moved = turned + carrying[..., :3, 3]
+        return cls(moved.astype(np.float32), facing.astype(np.float32), groups, poses, commanded_poses)
+
     def at(self, frames: Sequence[int]) -> "DrivenMotion":
         """Return the motion of some frames."""
         chosen = list(frames)

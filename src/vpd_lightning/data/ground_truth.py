@@ -19,9 +19,10 @@ from vpd_lightning.errors import DataError
 class GroundTruth:
     """What the simulator knew. World frame, metres, seconds, radians; quaternions w x y z, body to world.
 
-    ``segmentation`` is 0 for floor and background and ``i + 1`` for object ``i``. ``half_sizes`` are along the body's
-    own axes. Soft bodies have vertices as well (all bodies one after another), the object that each belongs to, and the
-    tetrahedra between them; their poses are those of the rigid motion that fits best, their half sizes those at rest.
+    ``segmentation`` is 0 for floor and background, ``i + 1`` for object ``i`` and 255 for what is driven (a robot).
+    ``half_sizes`` are along the body's own axes. Soft bodies have vertices as well (all bodies one after another), the
+    object that each belongs to, and the tetrahedra between them; their poses are those of the rigid motion that fits
+    best, their half sizes those at rest.
     """
 
     positions: NDArray[np.float64]  # (time, object, 3)
