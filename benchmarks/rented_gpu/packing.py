@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from vpd_lightning.data.driven_motion import DrivenMotion
 from vpd_lightning.data.frame_source import FrameSource
 from vpd_lightning.errors import DataError
 
@@ -64,6 +65,10 @@ class PackedTrajectory:
         of_views = self.intrinsics[list(views)], self.cam_to_world[list(views)]
         intrinsics, cam_to_world = (np.repeat(values[None], len(times), axis=0) for values in of_views)
         return intrinsics, cam_to_world
+
+    def driven(self, times: Sequence[int]) -> DrivenMotion | None:
+        """Return None: a packed set has no actions."""
+        return None
 
 
 def write_pack(

@@ -12,7 +12,7 @@ from data_gen.importers.conventions import checked_pose
 from data_gen.importers.robot_model import RobotModel, load_robot
 from data_gen.importers.source_files import choice
 from data_gen.settings import did_you_mean
-from vpd_lightning.data.driven import DrivenMotion
+from vpd_lightning.data.driven_motion import DrivenMotion
 from vpd_lightning.errors import ConfigError, DataError
 
 _KEYS = ("model", "joints", "state", "command", "unit", "base", "points")

@@ -21,7 +21,8 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from vpd_lightning.data.driven import DrivenMotion, check_driven
+from vpd_lightning.data.driven import check_driven
+from vpd_lightning.data.driven_motion import DrivenMotion
 from vpd_lightning.data.schema import ACTION_COMMANDED_POSES, ACTION_GROUPS, ACTION_NORMALS, ACTION_POINTS, ACTION_POSES
 from vpd_lightning.errors import DataError
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.importers.depth_registration import DepthCamera
-from vpd_lightning.data.driven import DrivenMotion
+from vpd_lightning.data.driven_motion import DrivenMotion
 from vpd_lightning.data.manifest import SPLITS
 
 MIN_FRAMES = 3  # two observed frames and one to predict

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.settings import did_you_mean
-from vpd_lightning.data.driven import DrivenMotion
+from vpd_lightning.data.driven_motion import DrivenMotion
 from vpd_lightning.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.importers.conventions import world_rotation
-from vpd_lightning.data.driven import DrivenMotion
+from vpd_lightning.data.driven_motion import DrivenMotion
 
 Array = NDArray[np.float64]
 

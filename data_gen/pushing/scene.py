@@ -18,7 +18,7 @@ from data_gen.settings import SPLIT_CODES
 from data_gen.simulate_and_render import simulate_and_render, trajectory_of
 from data_gen.stage_clock import StageClock
 from vpd_lightning.data import schema
-from vpd_lightning.data.driven import DrivenMotion
+from vpd_lightning.data.driven_motion import DrivenMotion
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 

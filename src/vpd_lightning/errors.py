@@ -17,6 +17,10 @@ class EditError(ConfigError):
     """An edit of a scene that is invalid, selects nothing, or cannot be read."""
 
 
+class ActionError(ConfigError):
+    """A given motion that does not fit the scene: too short, not finite, elsewhere, or with jumps."""
+
+
 class DataError(VPDError):
     """A data set or recording is missing, broken, or does not fit the configuration."""
 

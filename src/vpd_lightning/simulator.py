@@ -10,15 +10,19 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from vpd_lightning.actions import after_step, check_frame, checked_motion, expanded, with_next
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.encoder.base import AbstractEncoder
+from vpd_lightning.errors import ActionError
 from vpd_lightning.geometry.cameras import pixel_rays
+from vpd_lightning.geometry.occluders import with_driven
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.system import AbstractSystem
 from vpd_lightning.types import (
     NUM_CONTEXT_FRAMES,
     Cameras,
+    Driven,
     HiddenSide,
     Occluders,
     Particles,
@@ -55,12 +59,34 @@ class Rollout:
     num_steps: int
 
     @torch.no_grad()
-    def step(self) -> "Rollout":
-        """Return the rollout one step later."""
-        following, memory = self.simulator.dynamics(
-            self.previous, self.particles, self.memory, self.keys, self.num_steps
+    def step(self, driven: Driven | None = None) -> "Rollout":
+        """Return the rollout one step later.
+
+        ``driven`` says where what is driven will be then (axes ``1 driven`` or ``batch 1 driven``, 1 being the step;
+        several motions make a batch of as many rollouts). Without it, it stays where it is.
+
+        Raises:
+            ActionError: the motion does not fit the scene.
+        """
+        rollout, following = self, None
+        if driven is not None:
+            motion = checked_motion(self.particles, driven, 1)
+            rollout, following = self.branched(len(motion.mask)), motion[:, 0]
+        current = with_next(rollout.particles, following)
+        predicted, memory = self.simulator.dynamics(
+            rollout.previous, current, rollout.memory, rollout.keys, self.num_steps
         )
-        return replace(self, previous=self.particles, particles=following, memory=memory, num_steps=self.num_steps + 1)
+        predicted = after_step(predicted, current)
+        return replace(
+            rollout, previous=rollout.particles, particles=predicted, memory=memory, num_steps=self.num_steps + 1
+        )
+
+    def branched(self, count: int) -> "Rollout":
+        """Return ``count`` equal rollouts as one, a batch, to try as many actions; those already as many stay."""
+        if count == len(self.particles.mask):
+            return self
+        parts = {name: expanded(getattr(self, name), count) for name in ("previous", "particles", "memory", "keys")}
+        return replace(self, **parts)
 
 
 class Simulator(AbstractSystem):
@@ -103,11 +129,11 @@ class Simulator(AbstractSystem):
         previous = self.encoder(batch.context[:, 0], batch.keys, "previous")
         current = self.encoder(batch.context[:, 1], batch.keys, "current")
         num_steps = batch.rays.origins.shape[1]
-        states = self.unroll(previous.particles, current.particles, num_steps, batch.keys)
+        states = self.unroll(previous.particles, current.particles, num_steps, batch.keys, batch.driven)
         shown = [self._shown(state) for state in states]
         observed = self._observed(batch)
         # The light is learned from shadows of what is seen later: those of bodies in the wrong place would mislead it.
-        casting = _occluders(observed) if self.training else None
+        casting = _occluders(observed, batch.driven) if self.training else None
         rendered = self._render_steps(shown, batch.rays, batch.keys if self.training else None, casting)
         before = {f"previous_{name}": value for name, value in previous.auxiliary.items()}
         return SimulatorOutput(rendered, states, current.auxiliary | before | observed)
@@ -128,17 +154,34 @@ class Simulator(AbstractSystem):
         seen = [self.encoder.observe(batch.future[:, step], batch.keys, str(step)) for step in steps]
         return {f"future_{name}": torch.stack([step[name] for step in seen], dim=1) for name in seen[0]}
 
-    def unroll(self, previous: Particles, current: Particles, num_steps: int, keys: RandomKeys) -> list[Particles]:
-        """Apply the dynamics ``num_steps`` times; returns the predicted states, the first one a step after current."""
+    def unroll(
+        self,
+        previous: Particles,
+        current: Particles,
+        num_steps: int,
+        keys: RandomKeys,
+        driven: Driven | None = None,
+    ) -> list[Particles]:
+        """Apply the dynamics ``num_steps`` times; returns the predicted states, the first one a step after current.
+
+        ``driven`` is the given motion at these steps (axes ``batch step``). Motions for a batch of one scene make a
+        batch of rollouts from what was found once of the scene.
+        """
         memory = self.dynamics.initialize(previous, current, keys)
+        if driven is not None and len(driven.mask) != len(current.mask):
+            count = len(driven.mask)
+            previous, current = expanded(previous, count), expanded(current, count)
+            memory, keys = expanded(memory, count), expanded(keys, count)
         states = []
         for rollout_step in range(num_steps):
             noisy = self._add_location_noise(current, keys, rollout_step)
+            noisy = with_next(noisy, None if driven is None else driven[:, rollout_step])
             arguments = (previous, noisy, memory, keys, rollout_step)
             if self.checkpoint_dynamics and torch.is_grad_enabled():
                 following, memory = checkpoint(self.dynamics, *arguments, use_reentrant=False, preserve_rng_state=False)
             else:
                 following, memory = self.dynamics(*arguments)
+            following = after_step(following, noisy)
             previous, current = noisy, following
             states.append(following)
         return states
@@ -161,10 +204,12 @@ class Simulator(AbstractSystem):
         def flatten(tensors: Sequence[Tensor]) -> Tensor:
             return torch.stack(list(tensors), dim=1).flatten(0, 1)
 
-        hidden = None
-        if states[0].hidden_side is not None:
-            names = [item.name for item in fields(HiddenSide)]
-            hidden = {name: flatten([getattr(s.hidden_side, name) for s in states]) for name in names}
+        def flattened(kind: type, field: str) -> Any:
+            """Return a part of the states with an axis of its own; its features may be missing."""
+            parts = [getattr(state, field) for state in states]
+            names = [item.name for item in fields(kind) if getattr(parts[0], item.name, None) is not None]
+            return kind(**{name: flatten([getattr(part, name) for part in parts]) for name in names}) if names else None
+
         particles = Particles(
             positions=flatten([s.positions for s in states]),
             features=flatten([s.features for s in states]),
@@ -173,7 +218,8 @@ class Simulator(AbstractSystem):
             normals=None if states[0].normals is None else flatten([s.normals for s in states]),  # type: ignore[misc]
             scenery=states[0].scenery,
             occluders=occluders,
-            hidden_side=None if hidden is None else HiddenSide(**hidden),
+            hidden_side=flattened(HiddenSide, "hidden_side"),
+            driven=flattened(Driven, "driven"),
         )
         flat_rays = Rays(rays.origins.flatten(0, 1), rays.directions.flatten(0, 1))
         if keys is not None:  # one set of draws per (member, step); steps stay apart for up to a million steps
@@ -192,25 +238,49 @@ class Simulator(AbstractSystem):
         )
 
     @torch.no_grad()
-    def predict_frames(self, context: RGBDFrames, cameras: Cameras) -> Float[Tensor, "step view height width 3"]:
-        """Encode the two frames of the input views, roll out, and render step ``i`` from the cameras ``i``."""
-        scene = self.encode(context.rgb, context.depth, context.cameras)
-        states = self.rollout(scene, cameras.shape[0])
+    def predict_frames(
+        self, context: RGBDFrames, cameras: Cameras, driven: Driven | None = None
+    ) -> Float[Tensor, "step view height width 3"]:
+        """Encode the two frames of the input views, roll out, and render step ``i`` from the cameras ``i``.
+
+        ``driven`` is the given motion at these steps (axis ``step``).
+        """
+        scene = self.encode(context.rgb, context.depth, context.cameras, driven=context.driven)
+        states = self.rollout(scene, cameras.shape[0], driven=driven)
         return torch.cat([self.render([state], cameras[step]) for step, state in enumerate(states)])
+
+    @property
+    def takes_actions(self) -> bool:
+        """Whether the motion of what is driven is an input."""
+        return any(getattr(stage, "has_driven", False) for stage in (self.encoder, self.dynamics))
 
     # The Python interface to a trained model.
 
     @torch.no_grad()
     def encode(
-        self, rgb: Tensor | np.ndarray, depth: Tensor | np.ndarray, cameras: Cameras, keys: RandomKeys | None = None
+        self,
+        rgb: Tensor | np.ndarray,
+        depth: Tensor | np.ndarray,
+        cameras: Cameras,
+        keys: RandomKeys | None = None,
+        driven: Driven | None = None,
     ) -> Scene:
         """Encode two frames: ``rgb`` (2, view, height, width, 3) uint8 or [0, 1], ``depth`` in metres, floating point.
 
         Images are tensors or NumPy arrays (``Cameras.from_arrays`` makes cameras of arrays). ``cameras`` has axes
         ``view`` or ``2 view``. The draws (particle subsample) are the same every time, unless ``keys`` (for a batch of
         one) says otherwise. The current particles come with what the dynamics guesses of their hidden side.
+
+        ``driven`` is where what is driven (a robot) was in both frames (axes ``2 driven``), for a model that was
+        trained with actions.
+
+        Raises:
+            ValueError: shapes or types that are none of these.
+            ActionError: the model takes no actions, or what is driven is not where it is said to be.
         """
         self.eval()
+        if driven is not None and not self.takes_actions:
+            raise ActionError("this model was trained without actions.\nTrain one with actions=true.")
         rgb, depth = torch.as_tensor(rgb), torch.as_tensor(depth)
         if not depth.is_floating_point():
             raise ValueError(f"depth must be in metres, as floating point, got {depth.dtype}")
@@ -227,16 +297,27 @@ class Simulator(AbstractSystem):
         states = []
         for time, purpose in enumerate(("previous", "current")):
             here = cameras[time] if len(cameras.shape) == 2 else cameras
-            frames = RGBDFrames(rgb[time][None], depth[time][None], here[None])
+            frames = RGBDFrames(rgb[time][None], depth[time][None], here[None], _one_of(driven, time, depth))
+            check_frame(frames)
             states.append(self.encoder(frames, keys, purpose).particles)
         previous, current = states
         return Scene(previous, self.dynamics.completed(previous, current, keys))
 
     @torch.no_grad()
-    def rollout(self, scene: Scene, num_steps: int, keys: RandomKeys | None = None) -> list[Particles]:
-        """Return the predicted particles of the next ``num_steps`` steps (batch axis of 1)."""
+    def rollout(
+        self, scene: Scene, num_steps: int, keys: RandomKeys | None = None, driven: Driven | None = None
+    ) -> list[Particles]:
+        """Return the predicted particles of the next ``num_steps`` steps (batch axis of 1).
+
+        ``driven`` is where what is driven will be after each step (axes ``step driven``; without it, it stays). Several
+        motions (axes ``batch step driven``) roll out side by side, and the particles get that batch axis.
+
+        Raises:
+            ActionError: the motion is too short, not finite, of other points than the scene's, or jumps.
+        """
         self.eval()
-        return self.unroll(scene.previous, scene.current, num_steps, keys or RandomKeys.fixed(1))
+        motion = None if driven is None else checked_motion(scene.current, driven, num_steps)
+        return self.unroll(scene.previous, scene.current, num_steps, keys or RandomKeys.fixed(1), motion)
 
     @torch.no_grad()
     def start(self, scene: Scene, keys: RandomKeys | None = None) -> Rollout:
@@ -270,8 +351,18 @@ class Simulator(AbstractSystem):
         )
 
 
-def _occluders(observed: dict[str, Tensor]) -> Occluders | None:
-    """Return what was seen to move at each predicted step, axes ``batch * time``."""
+def _one_of(driven: Driven | None, time: int, like: Tensor) -> Driven | None:
+    """Return what is driven at one of two frames, with a batch axis of 1."""
+    if driven is None:
+        return None
+    if driven.mask.dim() != 2 or len(driven.mask) != 2:
+        raise ValueError(f"driven must have axes (2, point), for both frames; got {tuple(driven.mask.shape)}")
+    return driven[time][None].to(like.device, like.dtype)
+
+
+def _occluders(observed: dict[str, Tensor], driven: Driven | None) -> Occluders | None:
+    """Return what was seen to move and what was driven at each predicted step, axes ``batch * time``."""
     if "future_positions" not in observed:
         return None
-    return Occluders(observed["future_positions"].flatten(0, 1), observed["future_mask"].flatten(0, 1))
+    occluders = Occluders(observed["future_positions"].flatten(0, 1), observed["future_mask"].flatten(0, 1))
+    return with_driven(occluders, None if driven is None else driven.mapped(lambda values: values.flatten(0, 1)))

@@ -6,7 +6,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from vpd_lightning.types import Cameras, RGBDFrames, SimulatorOutput
+from vpd_lightning.types import Cameras, Driven, RGBDFrames, SimulatorOutput
 
 
 class AbstractSystem(nn.Module, ABC):
@@ -23,8 +23,11 @@ class AbstractSystem(nn.Module, ABC):
         """Predict what the batch supervises."""
 
     @abstractmethod
-    def predict_frames(self, context: RGBDFrames, cameras: Cameras) -> Float[Tensor, "step view height width 3"]:
+    def predict_frames(
+        self, context: RGBDFrames, cameras: Cameras, driven: Driven | None = None
+    ) -> Float[Tensor, "step view height width 3"]:
         """Predict the images that ``cameras`` (axes ``step view``) see after the frames of ``context`` (``time view``).
 
+        ``driven`` is what is given of the motion at these steps (axis ``step``), for systems that take actions.
         Without gradients and without randomness; colours in [0, 1].
         """

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import ArrayLike
 from torch import Tensor
 
@@ -15,7 +15,7 @@ from vpd_lightning.randomness import RandomKeys
 NUM_CONTEXT_FRAMES = 2
 """Observed frames that a model of particles starts from: two give each particle a position and a velocity."""
 
-OTHER_AXES = ("scenery", "occluders", "hidden_side")
+OTHER_AXES = ("scenery", "occluders", "hidden_side", "driven")
 """Fields of particles that have an axis of their own in place of that of the particles."""
 
 Border = TypeVar("Border", bound="_Border")
@@ -83,18 +83,88 @@ class Cameras(_Border):
 
 
 @dataclass(frozen=True)
+class Driven(_Border):
+    """Points on what is driven, such as a robot's surface, whose motion is given: an action.
+
+    World frame, metres; ``normals`` are outward and of unit length. ``groups`` counts the rigid parts from 0, ``mask``
+    is false for padding. Leading axes are those of the particles or frames that they come with, or ``batch step`` for
+    a motion. ``features`` (how each point looks, from an encoder) and where the points are one step later
+    (``next_positions``, ``next_normals``, for a dynamics) are there once they are known.
+    """
+
+    positions: Float[Tensor, "*shape driven 3"]
+    normals: Float[Tensor, "*shape driven 3"]
+    groups: Int[Tensor, "*shape driven"]
+    mask: _Mask = None  # type: ignore[assignment]
+    features: Float[Tensor, "*shape driven feature"] | None = None
+    next_positions: Float[Tensor, "*shape driven 3"] | None = None
+    next_normals: Float[Tensor, "*shape driven 3"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.mask is None:
+            object.__setattr__(self, "mask", torch.ones_like(self.groups, dtype=torch.bool))
+
+    @classmethod
+    def from_arrays(cls, points: ArrayLike, normals: ArrayLike, groups: ArrayLike | None = None) -> "Driven":
+        """Return a motion of NumPy arrays, nested lists or tensors: points and normals (..., step, point, 3) in metres.
+
+        ``groups`` (point) says which rigid part a point belongs to; None: all belong to one.
+
+        Raises:
+            ValueError: shapes that do not fit each other.
+        """
+        places, facing = (torch.as_tensor(part, dtype=torch.float32) for part in (points, normals))
+        if places.dim() < 3 or places.shape != facing.shape or places.shape[-1] != 3:
+            raise ValueError(
+                "points and normals of what is driven must both be (step, point, 3), "
+                f"got {tuple(places.shape)} and {tuple(facing.shape)}"
+            )
+        parts = torch.zeros(places.shape[-2]) if groups is None else torch.as_tensor(groups)
+        if parts.shape != places.shape[-2:-1]:
+            raise ValueError(
+                f"groups must name the part of each of {places.shape[-2]} points, got {tuple(parts.shape)}"
+            )
+        return cls(places, facing, parts.long().expand(places.shape[:-1]))
+
+    def __getitem__(self, index: Any) -> "Driven":
+        return self.mapped(lambda values: values[index])
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> "Driven":
+        """Apply a function to every tensor."""
+        known = {item.name: value for item in fields(self) if (value := getattr(self, item.name)) is not None}
+        return Driven(**{name: function(value) for name, value in known.items()})
+
+    def towards(self, following: "Driven") -> "Driven":
+        """Return the same points with where they are one step later; see ``next_positions``."""
+        return replace(self, next_positions=following.positions, next_normals=following.normals)
+
+    def advanced(self) -> "Driven":
+        """Return the points one step later, where that is known; otherwise as they are."""
+        if self.next_positions is None or self.next_normals is None:
+            return self
+        moved = replace(self, positions=self.next_positions, normals=self.next_normals)
+        return replace(moved, next_positions=None, next_normals=None)
+
+
+@dataclass(frozen=True)
 class RGBDFrames(_Border):
     """RGB-D images of one or more time steps; ``rgb`` is uint8, or float in [0, 1].
 
-    ``depth`` is z-depth in metres, 0 or non-finite where there is no measurement.
+    ``depth`` is z-depth in metres, 0 or non-finite where there is no measurement. ``driven`` is where what is driven
+    was at each of the time steps; it has no view axis.
     """
 
     rgb: Float[Tensor, "*shape height width 3"] | UInt8[Tensor, "*shape height width 3"]
     depth: Float[Tensor, "*shape height width"]
     cameras: Cameras
+    driven: Driven | None = None
 
     def __getitem__(self, index: Any) -> "RGBDFrames":
-        return RGBDFrames(self.rgb[index], self.depth[index], self.cameras[index])
+        driven = self.driven
+        if driven is not None:
+            each = index if isinstance(index, tuple) else (index,)
+            driven = driven[each[: driven.mask.dim() - 1]]
+        return RGBDFrames(self.rgb[index], self.depth[index], self.cameras[index], driven)
 
 
 @dataclass(frozen=True)
@@ -152,7 +222,8 @@ class Particles(_Border):
     where unknown) are observations carried along for a dynamics that uses them; the paper's does not. With ``scenery``
     particles that are not ``moving`` are for the dynamics alone: a renderer draws the scenery in their place.
     ``occluders`` cast the shadows in place of moving particles: in training, what was seen to move at that time.
-    ``hidden_side`` is what a dynamics guesses of them beyond what was seen.
+    ``hidden_side`` is what a dynamics guesses of them beyond what was seen. ``driven`` are points whose motion is given,
+    such as a robot's; they are no particles and have an axis of their own.
     """
 
     positions: Float[Tensor, "*batch particle 3"]
@@ -164,6 +235,7 @@ class Particles(_Border):
     scenery: Scenery | None = None
     occluders: Occluders | None = None
     hidden_side: HiddenSide | None = None
+    driven: Driven | None = None
 
     def __post_init__(self) -> None:
         if self.mask is None:
@@ -175,21 +247,34 @@ class Particles(_Border):
         return self.positions.shape[-2]
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> "Particles":
-        """Apply a function to every tensor with a particle axis; scenery, occluders and hidden side stay."""
+        """Apply a function to every tensor with a particle axis; scenery, occluders, hidden side and driven stay."""
         names = [item.name for item in fields(self) if item.name not in OTHER_AXES]
         known = {name: value for name in names if (value := getattr(self, name)) is not None}
         return replace(self, **{name: function(value) for name, value in known.items()})
 
     def with_hidden_side(self) -> "Particles":
         """Return what is drawn of the particles and of what is guessed beside them, as one set."""
-        hidden, normals = self.hidden_side, self.normals
+        hidden = self.hidden_side
         if hidden is None:
             return self
+        return self._drawn_with(hidden.positions, hidden.features, hidden.normals, hidden.mask, self.driven)
+
+    def with_driven(self) -> "Particles":
+        """Return what is drawn of the particles and of what is driven, as one set."""
+        driven = self.driven
+        if driven is None or driven.features is None:
+            return self
+        return self._drawn_with(driven.positions, driven.features, driven.normals, driven.mask, None)
+
+    def _drawn_with(
+        self, positions: Tensor, features: Tensor, normals: Tensor, mask: Tensor, driven: Driven | None
+    ) -> "Particles":
         return Particles(
-            positions=torch.cat([self.positions, hidden.positions], dim=-2),
-            features=torch.cat([self.features, hidden.features], dim=-2),
-            mask=torch.cat([self.mask, hidden.mask], dim=-1),
-            normals=None if normals is None else torch.cat([normals, hidden.normals], dim=-2),
+            positions=torch.cat([self.positions, positions], dim=-2),
+            features=torch.cat([self.features, features], dim=-2),
+            mask=torch.cat([self.mask, mask], dim=-1),
+            normals=None if self.normals is None else torch.cat([self.normals, normals], dim=-2),
+            driven=driven,
         )
 
     def without_padding(self) -> "Particles":
@@ -253,7 +338,8 @@ class VideoBatch(_Border):
 
     ``context`` has axes ``batch time=2 view ...``; ``rays`` and ``rgbs`` have axes ``batch time ray 3``, where time
     counts predicted steps. ``clips`` names each member (``file@start``) for messages. ``future`` are the frames of the
-    input views at the predicted steps (axes ``batch time view``), for trainings that encode them.
+    input views at the predicted steps (axes ``batch time view``), for trainings that encode them. ``driven`` is the
+    given motion at the predicted steps (axes ``batch time``), where the recordings have one.
     """
 
     context: RGBDFrames
@@ -262,6 +348,7 @@ class VideoBatch(_Border):
     keys: RandomKeys
     clips: Sequence[str] = field(default=())
     future: RGBDFrames | None = None
+    driven: Driven | None = None
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from tests.data.analytic_scene import known_trajectory
-from vpd_lightning.data.driven import DrivenMotion, read_driven
+from vpd_lightning.data.driven import read_driven
+from vpd_lightning.data.driven_motion import DrivenMotion
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.data.schema import write_trajectory
 from vpd_lightning.errors import DataError

@@ -9,7 +9,7 @@ from torch import Tensor
 from vpd_lightning.baselines.savi import SAVi
 from vpd_lightning.geometry.resizing import resize_images
 from vpd_lightning.system import AbstractSystem
-from vpd_lightning.types import Cameras, RenderedRays, RGBDFrames
+from vpd_lightning.types import Cameras, Driven, RenderedRays, RGBDFrames
 
 # Images at a time when nothing is trained: bounds the memory of a long video, and changes no result.
 _IMAGES_AT_ONCE = 32
@@ -71,7 +71,9 @@ class AbstractViewSystem(AbstractSystem):
         return ((images.movedim(-3, -1) + 1) / 2).clamp(0, 1).reshape(*slots.shape[:-2], *images.shape[-2:], 3)
 
     @torch.no_grad()
-    def predict_frames(self, context: RGBDFrames, cameras: Cameras) -> Float[Tensor, "step view height width 3"]:
+    def predict_frames(
+        self, context: RGBDFrames, cameras: Cameras, driven: Driven | None = None
+    ) -> Float[Tensor, "step view height width 3"]:
         """Continue the views of ``context``, which must be those of ``cameras``; resized to the cameras' pixels."""
         num_views = context.rgb.shape[1]
         if cameras.shape[1] != num_views:

@@ -12,7 +12,7 @@ from vpd_lightning.config.explaining import parsed
 from vpd_lightning.errors import ConfigError
 
 # Values that other sections refer to: whoever does not refer to one cannot depend on it.
-_SHARED = ("feature_dim", "color_features", "scenery", "checkpoint_dynamics")
+_SHARED = ("feature_dim", "color_features", "scenery", "actions", "checkpoint_dynamics")
 # Read by the program itself: the views that a trained model is shown, and the scene's name in reports.
 _READ_ANYWHERE = ("scene.name", "scene.input_views")
 # Settings that count beside a certain value of another one only: the other one, and what it has to be.

@@ -92,6 +92,7 @@ class TrainConfig:
     feature_dim: int = MISSING
     color_features: bool = MISSING
     scenery: bool = MISSING
+    actions: bool = MISSING
     light_fit: LightFitConfig = MISSING
     checkpoint_dynamics: bool = MISSING
     float32_matmul_precision: str = MISSING

@@ -10,10 +10,12 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vpd_lightning.data.collate import driven_tensors
+from vpd_lightning.data.driven import read_driven
 from vpd_lightning.data.ground_truth import GroundTruth, has_state, read_state
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.errors import ConfigError, DataError
-from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras
+from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras, Driven
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,8 @@ class Clip:
 
     ``cameras`` holds those of the context (axes ``time view``), ``target_cameras`` those of the predicted frames. The
     context ends with frame ``start + 1``; it begins with frame ``start`` for a model that sees two frames, and earlier
-    for one that sees more.
+    for one that sees more. ``driven`` is the given motion (axis ``time``) from the first frame of the context to the
+    last predicted one; None where the recording has none.
     """
 
     name: str
@@ -38,6 +41,17 @@ class Clip:
     workspace_max: tuple[float, float, float]
     frame_time: float
     state: GroundTruth | None
+    driven: Driven | None = None
+
+    @property
+    def context_driven(self) -> Driven | None:
+        """The given motion at the frames of the context."""
+        return None if self.driven is None else self.driven[: len(self.rgb)]
+
+    @property
+    def target_driven(self) -> Driven | None:
+        """The given motion at the frames to predict."""
+        return None if self.driven is None else self.driven[len(self.rgb) :]
 
     @property
     def current_frame(self) -> int:
@@ -106,6 +120,7 @@ def read_clip(
                 "or start earlier."
             )
         views = range(reader.num_views)
+        driven = read_driven(path)
         context, targets = range(first, start + NUM_CONTEXT_FRAMES), range(start + NUM_CONTEXT_FRAMES, last + 1)
         return Clip(
             name=f"{path.parent.name}/{path.name}@{start}",
@@ -121,6 +136,7 @@ def read_clip(
             workspace_max=reader.workspace_max,
             frame_time=reader.frame_time,
             state=read_state(path) if with_state and has_state(path) else None,
+            driven=None if driven is None else driven_tensors(driven.at(range(first, last + 1))),
         )
 
 

@@ -36,7 +36,8 @@ class VideoDataModule(pl.LightningDataModule):
     differ from the per-camera training median by more than the thresholds (largest colour channel, in [0, 1]; depth, in
     metres), or lie within ``moving_ray_margin`` pixels of one that does. With ``cache`` decoded frames stay in memory
     (in each loader worker; with the demo's small images use ``num_workers=0``). With ``load_future`` batches also hold
-    the input views' images of the frames to predict. ``sensor`` names a simulated sensor (``conf/sensor``) whose errors
+    the input views' images of the frames to predict, with ``load_driven`` what the recordings' actions drive.
+    ``sensor`` names a simulated sensor (``conf/sensor``) whose errors
     the training clips get, ``sensor_percent`` its noise at each trajectory's median depth; validation clips stay as
     they are.
     """
@@ -66,6 +67,7 @@ class VideoDataModule(pl.LightningDataModule):
         load_future: bool,
         sensor: str,
         sensor_percent: float | None,
+        load_driven: bool = False,
     ) -> None:
         """Check the numbers; files are first touched by ``setup``."""
         super().__init__()
@@ -85,7 +87,8 @@ class VideoDataModule(pl.LightningDataModule):
         self.moving_color_threshold, self.moving_depth_threshold = moving_color_threshold, moving_depth_threshold
         self.cache = cache
         self.num_validation_clips, self.num_validation_steps = num_validation_clips, num_validation_steps
-        self.validation_views, self.load_future = validation_views, load_future
+        self.validation_views = validation_views
+        self.load_future, self.load_driven = load_future, load_driven
         changes = {} if sensor_percent is None else {"percent_at_median": sensor_percent}
         self.sensor = load_sensor(sensor, changes)
         self.num_context_frames = NUM_CONTEXT_FRAMES
@@ -120,6 +123,7 @@ class VideoDataModule(pl.LightningDataModule):
             held_out = manifest.split("validation")[: self.num_validation_clips]
             self.validation = ValidationClips(
                 trajectories=[TrajectoryFrames(path, use_cache=False) for path in held_out],
+                load_driven=self.load_driven,
                 num_clips=self.num_validation_clips,
                 num_context_frames=self.num_context_frames,
                 num_steps=self.num_validation_steps,
@@ -178,6 +182,7 @@ class VideoDataModule(pl.LightningDataModule):
             start_frames=self.start_frames,
             moving_rays=moving_rays,
             load_future=self.load_future,
+            load_driven=self.load_driven,
             training_progress=self.training_progress,
         )
 

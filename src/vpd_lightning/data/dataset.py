@@ -9,7 +9,7 @@ from jaxtyping import Float32, Int, UInt8
 from scipy.ndimage import maximum_filter
 from torch.utils.data import Dataset
 
-from vpd_lightning.data.collate import ClipSample
+from vpd_lightning.data.collate import ClipSample, driven_tensors
 from vpd_lightning.data.frame_source import FrameSource
 from vpd_lightning.data.rollout_lengths import RolloutLengths, Schedule
 from vpd_lightning.errors import DataError
@@ -63,7 +63,7 @@ class ClipDataset(Dataset[ClipSample]):
 
     A sample is a clip of T + 2 frames of a trajectory: frames ``start`` and ``start + 1`` of the input views as
     context, and rays of frames ``start + 2 ... start + 1 + T`` of the target views with the colours seen along them.
-    With ``load_future`` the input views' images of those frames come too.
+    With ``load_future`` the input views' images of those frames come too, with ``load_driven`` the given motion of all.
 
     ``training_progress`` returns the share of the training that is done, where a time budget ends it instead of
     ``max_steps``.
@@ -84,6 +84,7 @@ class ClipDataset(Dataset[ClipSample]):
         start_frames: Sequence[int] | None,
         moving_rays: MovingRays | None,
         load_future: bool,
+        load_driven: bool = False,
         training_progress: Callable[[], float] | None = None,
     ) -> None:
         """Check that every trajectory has the frames, views and image size that the clips need.
@@ -101,7 +102,7 @@ class ClipDataset(Dataset[ClipSample]):
         self.rollout_lengths = RolloutLengths(num_steps, num_steps_schedule)
         self.input_views, self.target_views = list(input_views), list(target_views)
         self.start_frames = None if start_frames is None else list(start_frames)
-        self.moving_rays, self.load_future = moving_rays, load_future
+        self.moving_rays, self.load_future, self.load_driven = moving_rays, load_future, load_driven
         self.training_progress = training_progress
         self._moving_pixels: dict[tuple[int, int], np.ndarray] = {}
         longest = self.rollout_lengths.longest
@@ -142,6 +143,7 @@ class ClipDataset(Dataset[ClipSample]):
             step=step,
             sample_index=sample_index,
             clip=f"{trajectory.path.parent.name}/{trajectory.path.name}@{start}",
+            driven=driven_tensors(trajectory.driven(range(start, targets.stop))) if self.load_driven else None,
         )
 
     def _target_rays(

@@ -7,6 +7,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from vpd_lightning.data.driven_motion import DrivenMotion
+
 
 @runtime_checkable
 class FrameSource(Protocol):
@@ -40,3 +42,6 @@ class FrameSource(Protocol):
         self, times: Sequence[int], views: Sequence[int]
     ) -> tuple[Float[np.ndarray, "time view 3 3"], Float[np.ndarray, "time view 4 4"]]:
         """Return (intrinsics in pixels, cam_to_world in metres) in float64."""
+
+    def driven(self, times: Sequence[int]) -> DrivenMotion | None:
+        """Return the given motion at the given frames; None where the recording has none."""

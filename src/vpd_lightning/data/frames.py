@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from vpd_lightning.data.driven import read_driven
+from vpd_lightning.data.driven_motion import DrivenMotion
 from vpd_lightning.data.reader import ReaderCache, TrajectoryReader
 
 MAX_OPEN_FILES = 256  # the paper's largest training split; a process may usually open 1,024
@@ -59,6 +61,15 @@ class TrajectoryFrames:
         """Return (intrinsics in pixels, cam_to_world in metres) in float64."""
         block = np.ix_(list(times), list(views))
         return self._intrinsics[block], self._cam_to_world[block]
+
+    def driven(self, times: Sequence[int]) -> DrivenMotion | None:
+        """Return the given motion at the given frames; None where the recording has none."""
+        motion = self._driven
+        return None if motion is None else motion.at(times)
+
+    @functools.cached_property
+    def _driven(self) -> DrivenMotion | None:
+        return read_driven(self.path)
 
     @property
     def is_static(self) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset
 
+from vpd_lightning.data.collate import driven_tensors
 from vpd_lightning.data.dataset import require_clips
 from vpd_lightning.data.frames import TrajectoryFrames
 from vpd_lightning.types import Cameras, RGBDFrames
@@ -48,10 +49,12 @@ class ValidationClips(Dataset[VideoClip]):
         input_views: Sequence[int],
         target_views: Sequence[int],
         start_frames: Sequence[int] | None,
+        load_driven: bool = False,
     ) -> None:
         require_clips(trajectories, num_steps, [*input_views, *target_views], start_frames, num_context_frames)
         self.num_context_frames, self.num_steps = num_context_frames, num_steps
         self.input_views, self.target_views = list(input_views), list(target_views)
+        self.load_driven = load_driven
         self.clips: list[tuple[TrajectoryFrames, int]] = []
         for index in range(num_clips):
             lap, place = divmod(index, len(trajectories))
@@ -73,17 +76,17 @@ class ValidationClips(Dataset[VideoClip]):
         trajectory, start = self.clips[index]
         first_target = start + self.num_context_frames
         return VideoClip(
-            context=_frames(trajectory, range(start, first_target), self.input_views),
-            target=_frames(trajectory, range(first_target, first_target + self.num_steps), self.target_views),
+            context=self._frames(trajectory, range(start, first_target), self.input_views),
+            target=self._frames(trajectory, range(first_target, first_target + self.num_steps), self.target_views),
             name=f"{trajectory.path.parent.name}/{trajectory.path.name}@{start}",
             number=index,
         )
 
-
-def _frames(trajectory: TrajectoryFrames, times: Sequence[int], views: Sequence[int]) -> RGBDFrames:
-    intrinsics, cam_to_world = (torch.from_numpy(part).float() for part in trajectory.cameras(times, views))
-    return RGBDFrames(
-        rgb=torch.from_numpy(trajectory.rgb(times, views)),
-        depth=torch.from_numpy(trajectory.depth(times, views)),
-        cameras=Cameras(intrinsics, cam_to_world, trajectory.height, trajectory.width),
-    )
+    def _frames(self, trajectory: TrajectoryFrames, times: Sequence[int], views: Sequence[int]) -> RGBDFrames:
+        intrinsics, cam_to_world = (torch.from_numpy(part).float() for part in trajectory.cameras(times, views))
+        return RGBDFrames(
+            rgb=torch.from_numpy(trajectory.rgb(times, views)),
+            depth=torch.from_numpy(trajectory.depth(times, views)),
+            cameras=Cameras(intrinsics, cam_to_world, trajectory.height, trajectory.width),
+            driven=driven_tensors(trajectory.driven(times)) if self.load_driven else None,
+        )

@@ -15,13 +15,14 @@ from torch import Tensor, nn
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.blocks import MLP, EdgeUpdater, NodeUpdater
 from vpd_lightning.dynamics.delayed_faults import DelayedFaults
+from vpd_lightning.dynamics.graph_inputs import driven_of, driven_tensors, rows_in_use, usable
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.graph.hierarchical import EdgeSet, HierarchicalGraph, build_graph, draw_priorities
 from vpd_lightning.graph.incidence import Incidence, gather_to_edges
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.graph.static_graph import build_static_graph
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles, require_finite
+from vpd_lightning.types import Driven, Particles, require_finite
 
 
 class HierarchicalGNNDynamics(AbstractDynamics):
@@ -57,8 +58,6 @@ class HierarchicalGNNDynamics(AbstractDynamics):
     ``max_abstract_edges_per_node`` is an approximation, off in the paper: an abstract node receives from that many
     nearest ones only, so that edges grow with the abstract nodes and not with their square.
 
-    Checkpoints from before these three arguments load with null, null and false (``config.migrations``): what they did.
-
     ``zero_init_decoders`` starts the last layers of both decoders at zero, so that before training nothing moves and no
     feature changes. ``normalized_edges`` divides relative positions by the radius within which edges are drawn (``r_s``
     or ``r_a_s``): the same functions, from inputs of order one whatever the scene's unit of length. ``edge_gain``
@@ -74,6 +73,12 @@ class HierarchicalGNNDynamics(AbstractDynamics):
     # Paper: features are updated.
     # Paper: neither zero_init_decoders nor normalized_edges; relative positions of a few centimetres are a hundredth of
     # what the layers are initialised for. Its aggregation is not printed.
+
+    With ``has_driven`` the driven points of the current particles are senders of a fourth kind, connected to abstract
+    nodes as particles are: their initial feature is the displacement that they are given in this step (in location
+    scales) and their normal. They are not updated.
+
+    # Paper: has no actions, so has_driven is false and there is nothing of it.
 
     ``last_uncovered_share`` is the share of current particles without abstract node in reach in the last call.
     """
@@ -102,6 +107,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         edge_gain: float,
         aggregation: str,
         update_features: bool,
+        has_driven: bool = False,
     ) -> None:
         super().__init__()
         counts = {
@@ -172,6 +178,11 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         self.decode_feature = (
             MLP(hidden_dim, (hidden_dim, hidden_dim, hidden_dim, feature_dim)) if update_features else None
         )
+        self.has_driven = has_driven
+        if has_driven:  # behind all others, whose random weights are then those of a model without
+            self.encode_node["driven"] = MLP(6, widths)
+            self.encode_edge["driven_to_abstract"] = MLP(3, widths)
+            self.update_edge["driven_to_abstract"] = EdgeUpdater(hidden_dim, num_node_inputs=1)
         if zero_init_decoders:
             for decoder in (self.decode_location, self.decode_feature):
                 if decoder is not None:
@@ -203,6 +214,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         if self.edge_capacity is not None and current.num_particles:
             return self._static_advance(previous, current, generators, num_abstract_nodes)
         previous, whole = previous.without_padding(), current.without_padding()
+        driven = current.driven if self.has_driven else None
         require_finite(
             "Dynamics",
             positions=torch.cat([previous.positions, whole.positions], dim=1),
@@ -210,7 +222,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         )
         # Rows that are padding in all members would cost as much as particles: encoders leave a third where the
         # workspace holds fewer pixels than num_particles.
-        previous, current = _rows_in_use(previous), _rows_in_use(whole)
+        previous, current = rows_in_use(previous), replace(rows_in_use(whole), driven=driven)
         graph = build_graph(
             previous,
             current,
@@ -244,6 +256,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
             priorities,
             (previous.positions, previous.features, previous.mask),
             (current.positions, current.features, current.mask),
+            driven_tensors(current.driven) if self.has_driven else None,
         )
         if self.is_compiled and device.type == "cuda":
             # A CUDA graph writes its next results over these.
@@ -283,15 +296,21 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         self, previous: Particles, current: Particles, graph: HierarchicalGraph
     ) -> Float[Tensor, "node feature"]:
         """Return the updated latents of all current particles: Algorithm 1 from the encoders to the decoders."""
-        positions = {"previous": _usable(previous, "positions"), "current": _usable(current, "positions")}
+        has_driven = graph.driven_to_abstract is not None
+        positions = {"previous": usable(previous, "positions"), "current": usable(current, "positions")}
         positions["abstract"] = positions["current"].index_select(0, graph.abstract_index)
-        edge_sets: dict[str, EdgeSet] = {name: getattr(graph, name) for name in self.encode_edge}
+        names = [name for name in self.encode_edge if name != "driven_to_abstract" or has_driven]
+        edge_sets: dict[str, EdgeSet] = {name: getattr(graph, name) for name in names}
 
         # Encode particle nodes and edges.
         nodes = {
-            "previous": self.encode_node["previous"](_usable(previous, "features")),
-            "current": self.encode_node["current"](_usable(current, "features")),
+            "previous": self.encode_node["previous"](usable(previous, "features")),
+            "current": self.encode_node["current"](usable(current, "features")),
         }
+        if has_driven:
+            assert current.driven is not None
+            positions["driven"] = usable(current.driven, "positions")
+            nodes["driven"] = self.encode_node["driven"](self._driven_inputs(current.driven))
         edges = {}
         for name, edge_set in edge_sets.items():
             sender_type, receiver_type = name.split("_to_")
@@ -303,13 +322,15 @@ class HierarchicalGNNDynamics(AbstractDynamics):
             edges[name] = self.encode_edge[name](relative)
 
         # Update particle -> abstract edges, then abstract nodes.
-        messages = []
+        total: Tensor | None = None
         gathered = Incidence.mean if self.aggregation == "mean" else Incidence.summed
-        for sender_type in ("previous", "current"):
+        for sender_type in nodes:
             name = f"{sender_type}_to_abstract"
             updated = self.update_edge[name](edges.pop(name), nodes[sender_type], None, edge_sets[name])
-            messages.append(gathered(edge_sets[name].receivers, updated))
-        abstract = self.update_node["abstract_first"](None, messages[0] + messages[1])
+            message = gathered(edge_sets[name].receivers, updated)
+            total = message if total is None else total + message
+        assert total is not None
+        abstract = self.update_node["abstract_first"](None, total)
 
         # Perform message passing among abstract nodes.
         edge_set, among = edge_sets["abstract_to_abstract"], edges.pop("abstract_to_abstract")
@@ -326,19 +347,11 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         )
         return self.update_node["current"](nodes["current"], gathered(edge_set.receivers, updated))
 
-
-def _usable(particles: Particles, name: str) -> Float[Tensor, "node any"]:
-    """Return one field, flat, with zeros for padding, whose numbers must not get anywhere, not even as NaN times 0."""
-    return torch.where(particles.mask[..., None], getattr(particles, name), 0.0).flatten(0, 1)
-
-
-def _rows_in_use(particles: Particles) -> Particles:
-    """Return places, features and mask up to the last particle that is valid in any member (at least one row)."""
-    used = particles.mask.any(dim=0).nonzero()
-    count = int(used[-1]) + 1 if len(used) else 1
-    if count >= particles.num_particles:
-        return particles
-    return Particles(particles.positions[:, :count], particles.features[:, :count], particles.mask[:, :count])
+    def _driven_inputs(self, driven: Driven) -> Float[Tensor, "node 6"]:
+        """Return the displacement of this step (in location scales) and the normal of each driven point."""
+        step = (driven.advanced().positions - driven.positions) / self.location_scale
+        inputs = torch.cat([step, driven.normals], dim=-1)
+        return torch.where(driven.mask[..., None], inputs, 0.0).flatten(0, 1)
 
 
 def _uncovered_share(current: Particles, graph: HierarchicalGraph) -> Float[Tensor, ""]:
@@ -351,12 +364,14 @@ def static_step(
     priorities: Float64[Tensor, "batch particle"],
     previous_tensors: tuple[Tensor, Tensor, Tensor],
     current_tensors: tuple[Tensor, Tensor, Tensor],
+    given_motion: tuple[Tensor, Tensor, Tensor, Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Take one step with fixed shapes; positions, features and masks in, because compilers trace tensors alone.
 
     Returns positions, features, the share of uncovered particles, the edges dropped and the particles not finite.
     """
-    previous, current = Particles(*previous_tensors), Particles(*current_tensors)
+    previous = Particles(*previous_tensors)
+    current = replace(Particles(*current_tensors), driven=driven_of(given_motion))
     built = build_static_graph(
         previous,
         current,

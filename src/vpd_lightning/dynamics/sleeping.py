@@ -12,7 +12,7 @@ from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.support import on_ground, within_reach
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Driven, Particles
 
 _INNER = "dynamics."
 
@@ -49,7 +49,8 @@ class SleepingDynamics(AbstractDynamics):
       ``rest_drift / rest_steps`` a step, stays awake;
     - it is supported: it belongs to an island, linked by distances up to ``link_radius``, that is at least
       ``ground_width`` wide. A body in flight (at its apex, or with its floor deleted) is an island by itself;
-    - nothing that moves faster than ``rest_speed`` is within ``wake_radius`` of it, now or one such step ahead.
+    - nothing that moves faster than ``rest_speed``, driven or not, is within ``wake_radius`` of it, now or one such
+      step ahead.
 
     A sleeping particle keeps its position bit for bit. It wakes when something that moves comes within
     ``wake_radius``; take it larger than a body and a step, then bodies wake as a whole and before contact.
@@ -147,6 +148,8 @@ class SleepingDynamics(AbstractDynamics):
                 f"the memory is of {tuple(memory.asleep.shape)} particles, but there are {tuple(current.mask.shape)}: "
                 "rebuild it with initialize after an edit"
             )
+        if current.driven is not None and bool(memory.asleep.any()):
+            memory = self._woken(current, current.driven, memory)
         awake = current.mask & ~memory.asleep
         num_valid = current.mask.sum().clamp(min=1)
         self.last_awake_share = self.last_active_share = float(awake.sum() / num_valid)
@@ -168,6 +171,22 @@ class SleepingDynamics(AbstractDynamics):
             positions = torch.where(fallen, settled.rest_positions, following.positions)
             following = replace(following, positions=positions)
         return following, settled
+
+    @torch.no_grad()
+    def _woken(self, current: Particles, driven: Driven, memory: SleepingMemory) -> SleepingMemory:
+        """Wake what a driven point comes near in this step; a dynamics with a memory wakes whole scenes."""
+        following = driven.advanced().positions
+        moving = driven.mask & (_length(following - driven.positions) > self.rest_speed)
+        asleep = memory.asleep.clone()
+        for member, movers in enumerate(moving):
+            if not bool(movers.any()) or not bool(asleep[member].any()):
+                continue
+            path = torch.cat([driven.positions[member][movers], following[member][movers]])
+            sleepers = asleep[member].nonzero()[:, 0]
+            near = within_reach(current.positions[member][sleepers], path, self.wake_radius, self.neighbors_backend)
+            asleep[member, sleepers] = ~near if memory.inner is None else ~near.any().expand_as(near)
+        woken = memory.asleep & ~asleep
+        return replace(memory, asleep=asleep, num_rested=memory.num_rested.masked_fill(woken, 0))
 
     def _advance_members(
         self, previous: Particles, current: Particles, awake: Tensor, keys: RandomKeys, rollout_step: int
@@ -294,7 +313,8 @@ def _kept(following: Particles, current: Particles, asleep: Bool[Tensor, "batch 
 
 def _taken(particles: Particles, member: int, index: Int64[Tensor, " active"]) -> Particles:
     """Return some particles of one member, as a batch of one."""
-    return replace(particles.mapped(lambda values: values[member][index][None]), scenery=None)
+    driven = None if particles.driven is None else particles.driven[member : member + 1]
+    return replace(particles.mapped(lambda values: values[member][index][None]), scenery=None, driven=driven)
 
 
 def _without_inner_prefix(module: Any, state: dict[str, Any], prefix: str, metadata: Any) -> None:

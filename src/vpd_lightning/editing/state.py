@@ -90,7 +90,8 @@ def joined(first: Particles, second: Particles) -> Particles:
     stands_still = second.mask if second.moving is None else second.mask & ~second.moving
     if first.scenery is not None and second.scenery is None and bool(stands_still.any()):
         raise EditError("Only one of the two scenes has scenery.\nEncode both with the same model.")
-    parts: dict[str, Any] = {"scenery": joined_scenery(first.scenery, second.scenery)}
+    scenery = joined_scenery(first.scenery, second.scenery)
+    parts: dict[str, Any] = {"scenery": scenery, "driven": first.driven}
     for item in fields(first):
         if item.name in OTHER_AXES:
             continue

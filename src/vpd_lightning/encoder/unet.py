@@ -37,6 +37,7 @@ class UNetEncoder(UnprojectingEncoder):
         color_features: bool,
         same_pixels: bool,
         has_scenery: bool,
+        has_driven: bool = False,
     ):
         super().__init__(
             network=UNetNetwork(channels=channels, in_channels=3),
@@ -50,6 +51,7 @@ class UNetEncoder(UnprojectingEncoder):
             color_features=color_features,
             same_pixels=same_pixels,
             has_scenery=has_scenery,
+            has_driven=has_driven,
         )
 
     def pixel_features(self, rgb: Float[Tensor, "*shape height width 3"]) -> Tensor:

@@ -37,6 +37,7 @@ class DepthPredictingEncoder(UnprojectingEncoder):
         workspace_min: Sequence[float],
         workspace_max: Sequence[float],
         initial_depth: float,
+        has_driven: bool = False,
     ):
         if not 0 < initial_depth < math.inf:
             raise ValueError(f"initial_depth must be a finite number of metres above 0, got {initial_depth}")
@@ -53,6 +54,7 @@ class DepthPredictingEncoder(UnprojectingEncoder):
             color_features=False,
             same_pixels=False,
             has_scenery=False,
+            has_driven=has_driven,
         )
         last = network.up[-1]
         assert isinstance(last, nn.Conv2d) and last.bias is not None

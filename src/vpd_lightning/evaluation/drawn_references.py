@@ -10,7 +10,7 @@ from torch import Tensor
 from vpd_lightning.data.clip import Clip
 from vpd_lightning.evaluation.bodies import Body, find_bodies
 from vpd_lightning.evaluation.motion import valid_positions
-from vpd_lightning.evaluation.prediction import PredictsVideo, render_steps, stand_still
+from vpd_lightning.evaluation.prediction import PredictsVideo, render_steps, roll_out_clip, stand_still
 from vpd_lightning.metrics.body_dynamics import best_rotation
 from vpd_lightning.metrics.registry import NOTHING_MOVES, TRUE_MOTION, TRUE_VELOCITY
 from vpd_lightning.simulator import Scene
@@ -25,23 +25,23 @@ def drawn_references(
 
     Nothing moves; bodies keep the true velocity and rotation between the two input frames; bodies move as they truly
     do, with the features that the dynamics gives them at that step (its shading). The last is about the best that any
-    dynamics can reach with this encoder and this renderer. The clip must have ground truth; a body's particles are
-    those within ``margin`` metres of it. Colours are in [0, 1].
+    dynamics can reach with this encoder and this renderer. In the last two, what is driven moves as it was given. The
+    clip must have ground truth; a body's particles are those within ``margin`` metres of it. Colours are in [0, 1].
     """
     num_steps = clip.target_rgb.shape[0]
     current = scene.current
     bodies = find_bodies(clip, valid_positions(current), margin, num_steps)
+    predicted = roll_out_clip(simulator, scene, clip, num_steps)
+
+    def carried(places: list[Tensor]) -> list[Particles]:
+        states = _carried(current, bodies, places, num_steps)
+        return [replace(state, driven=known.driven) for state, known in zip(states, predicted, strict=True)]
+
+    true = carried([body.true for body in bodies])
     moved = {
         NOTHING_MOVES: [current] * num_steps,
-        TRUE_VELOCITY: _carried(current, bodies, [_kept_velocity(body, num_steps) for body in bodies], num_steps),
-        TRUE_MOTION: [
-            _with_features_of(predicted, state)
-            for state, predicted in zip(
-                _carried(current, bodies, [body.true for body in bodies], num_steps),
-                simulator.rollout(scene, num_steps),
-                strict=True,
-            )
-        ],
+        TRUE_VELOCITY: carried([_kept_velocity(body, num_steps) for body in bodies]),
+        TRUE_MOTION: [_with_features_of(known, state) for known, state in zip(predicted, true, strict=True)],
     }
     images = {}
     for name, states in moved.items():

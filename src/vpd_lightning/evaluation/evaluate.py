@@ -26,6 +26,7 @@ from vpd_lightning.evaluation.prediction import (
     has_particles,
     num_context_frames,
     predict_clip,
+    roll_out_clip,
     views_seen,
     without_depth,
 )
@@ -190,7 +191,7 @@ def _roll_out_long(
         scene = encode_clip(simulator, without_depth(clip) if hide_depth else clip, input_views)
         if not has_particles(scene):
             break
-        positions = trajectory_of(scene.current, simulator.rollout(scene, protocol.num_long_steps))
+        positions = trajectory_of(scene.current, roll_out_clip(simulator, scene, clip, protocol.num_long_steps))
         motion, bodies = clip_motion(clip, positions, protocol.body_margin, None)
         rollouts.append(judge_long_rollout(clip.name, number, positions, bodies, motion))
     return rollouts

@@ -100,10 +100,32 @@ def check_views(clip: Clip, input_views: Sequence[int]) -> None:
 
 
 def encode_clip(simulator: PredictsVideo, clip: Clip, input_views: Sequence[int]) -> Scene:
-    """Encode the context frames of a clip as the input views see them."""
+    """Encode the context frames of a clip as the input views see them, with what is driven if the system takes it."""
     check_views(clip, input_views)
     views = list(input_views)
-    return simulator.encode(clip.rgb[:, views], clip.depth[:, views], clip.cameras[:, views])
+    shown = clip.rgb[:, views], clip.depth[:, views], clip.cameras[:, views]
+    if clip.context_driven is None or not takes_actions(simulator):
+        return simulator.encode(*shown)
+    return simulator.encode(*shown, driven=clip.context_driven)  # type: ignore[call-arg]
+
+
+def roll_out_clip(simulator: PredictsVideo, scene: Scene, clip: Clip, num_steps: int) -> list[Particles]:
+    """Roll a scene of ``encode_clip`` out, with the given motion of the clip if the system asks for it.
+
+    What is driven stays where it is after the last frame of the clip.
+    """
+    motion = clip.target_driven
+    if motion is None or not takes_actions(simulator):
+        return simulator.rollout(scene, num_steps)
+    missing = num_steps - len(motion.mask)
+    if missing > 0:
+        motion = motion.mapped(lambda values: torch.cat([values, values[-1:].expand(missing, *values.shape[1:])]))
+    return simulator.rollout(scene, num_steps, driven=motion)  # type: ignore[call-arg]
+
+
+def takes_actions(system: PredictsVideo | PredictsViews) -> bool:
+    """Whether the motion of what is driven is an input of a system."""
+    return bool(getattr(system, "takes_actions", False))
 
 
 def stand_still(cameras: Cameras) -> bool:
@@ -137,7 +159,7 @@ def _predict_particles(simulator: PredictsVideo, clip: Clip, input_views: Sequen
     ticks = [_now()]
     scene = encode_clip(simulator, clip, input_views)
     ticks.append(_now())
-    states = simulator.rollout(scene, clip.target_rgb.shape[0])
+    states = roll_out_clip(simulator, scene, clip, clip.target_rgb.shape[0])
     ticks.append(_now())
     images = render_steps(simulator, states, clip.target_cameras).float().cpu()
     ticks.append(_now())

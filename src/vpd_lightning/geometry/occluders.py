@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vpd_lightning.types import Occluders, Particles
+from vpd_lightning.types import Driven, Occluders, Particles
 
 MOST_OCCLUDERS = 2048
 """That an encoder keeps of what moved when it saw the scenery."""
@@ -13,13 +13,22 @@ MOST_OCCLUDERS = 2048
 def occluders_of(particles: Particles) -> Occluders:
     """Return what casts shadows, at most ``MOST_OCCLUDERS`` points (metres); evenly spread over their slots.
 
-    Those are the particles' ``occluders`` where they have some, otherwise the moving ones. Slots are in random order
-    but after edits, where what was added comes last and casts shadows as well.
+    Those are the particles' ``occluders`` where they have some, otherwise the moving ones and what is driven. Slots are
+    in random order but after edits, where what was added comes last and casts shadows as well.
     """
     if particles.occluders is not None:
         return thinned(particles.occluders, MOST_OCCLUDERS)
     mask = particles.mask if particles.moving is None else particles.mask & particles.moving
-    return thinned(Occluders(particles.positions, mask), MOST_OCCLUDERS)
+    return thinned(with_driven(Occluders(particles.positions, mask), particles.driven), MOST_OCCLUDERS)
+
+
+def with_driven(occluders: Occluders, driven: Driven | None) -> Occluders:
+    """Return the points with those of what is driven behind them."""
+    if driven is None:
+        return occluders
+    return Occluders(
+        torch.cat([occluders.positions, driven.positions], dim=1), torch.cat([occluders.mask, driven.mask], dim=1)
+    )
 
 
 def thinned(occluders: Occluders, most: int) -> Occluders:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from vpd_lightning.graph.incidence import Incidence
 from vpd_lightning.graph.neighbors import PointIndex
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Driven, Particles
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class HierarchicalGraph:
 
     The edges at particles are a table, a fixed number for each particle with padding where there is no abstract node
     in reach; both directions between current particles and abstract nodes share one. The edges among abstract nodes
-    are sorted by receiver. ``is_covered`` tells which current particles have an abstract node within reach.
+    are sorted by receiver. ``is_covered`` tells which current particles have an abstract node within reach. Driven points,
+    where the current particles have some, send to abstract nodes and receive nothing.
     """
 
     abstract_index: Int64[Tensor, " abstract_node"]
@@ -42,6 +43,7 @@ class HierarchicalGraph:
     current_to_abstract: EdgeSet
     abstract_to_abstract: EdgeSet
     is_covered: Bool[Tensor, "batch particle"]
+    driven_to_abstract: EdgeSet | None = None
 
     @property
     def abstract_to_current(self) -> EdgeSet:
@@ -87,9 +89,12 @@ def build_graph(
     if len(generators) != batch_size:
         raise ValueError(f"One generator per batch member is needed: got {len(generators)} for {batch_size}.")
     # -1 stands for "no abstract node" until their number is known.
+    nodes: dict[str, Particles | Driven] = {"previous": previous, "current": current}
+    if current.driven is not None:
+        nodes["driven"] = current.driven
     abstract_neighbors = {
         name: torch.full((*particles.mask.shape, max_abstract_neighbors), -1, device=particles.mask.device)
-        for name, particles in (("previous", previous), ("current", current))
+        for name, particles in nodes.items()
     }
     among: list[tuple[Tensor, Tensor]] = []
     chosen: list[Tensor] = []
@@ -101,7 +106,7 @@ def build_graph(
         members_choice = valid.index_select(0, order.to(valid.device))
         centers = current.positions[member].index_select(0, members_choice)
         index = PointIndex(centers, backend, is_graph=True)
-        for name, particles in (("previous", previous), ("current", current)):
+        for name, particles in nodes.items():
             rows = particles.mask[member].nonzero()[:, 0]
             near = index.knn(particles.positions[member].index_select(0, rows), max_abstract_neighbors, r_s)
             abstract_neighbors[name][member, rows] = torch.where(near.mask, near.index + num_abstract, -1)
@@ -127,6 +132,9 @@ def build_graph(
             else edges_from_table(*joined)
         ),
         is_covered=(abstract_neighbors["current"] >= 0).any(dim=2),
+        driven_to_abstract=(
+            edges_to_abstract(abstract_neighbors["driven"].flatten(0, 1), num_abstract) if "driven" in nodes else None
+        ),
     )
 
 

@@ -18,7 +18,7 @@ from vpd_lightning.graph.hierarchical import (
     without_self,
 )
 from vpd_lightning.graph.incidence import Incidence
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Driven, Particles
 
 _PAIRS_PER_CHUNK = {"cpu": 1 << 20, "cuda": 1 << 26}
 """How many distances live at once; a compiler cuts its own pieces."""
@@ -69,7 +69,10 @@ def build_static_graph(
     centers = _usable(current.positions.gather(1, chosen[..., None].expand(-1, -1, 3)), is_node)
 
     abstract_neighbors = []
-    for particles in (previous, current):
+    nodes: list[Particles | Driven] = [previous, current]
+    if current.driven is not None:
+        nodes.append(current.driven)
+    for particles in nodes:
         queries = _usable(particles.positions, particles.mask)
         index, mask = _nearest(queries, centers, is_node, max_abstract_neighbors, r_s)
         mask = mask & particles.mask[..., None]
@@ -87,6 +90,11 @@ def build_static_graph(
         current_to_abstract=edges_to_abstract(abstract_neighbors[1].flatten(0, 1), batch_size * num_abstract),
         abstract_to_abstract=among,
         is_covered=(abstract_neighbors[1] >= 0).any(dim=2),
+        driven_to_abstract=(
+            None
+            if current.driven is None
+            else edges_to_abstract(abstract_neighbors[2].flatten(0, 1), batch_size * num_abstract)
+        ),
     )
     return StaticGraph(graph, dropped, _non_finite(previous) + _non_finite(current))
 

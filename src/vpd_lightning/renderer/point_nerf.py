@@ -160,7 +160,7 @@ class PointNeRFRenderer(AbstractRenderer):
             NonFiniteError: when a particle or a ray is not finite.
             ValueError: when ``keys`` do not name one sample per member of the batch axis.
         """
-        particles = particles.without_padding()
+        particles = particles.with_driven().without_padding()
         require_finite(
             "Rendering",
             positions=particles.positions,
@@ -199,7 +199,7 @@ class PointNeRFRenderer(AbstractRenderer):
         self, particles: Particles, queries: Float[Tensor, "batch query 3"]
     ) -> Float[Tensor, "batch query feature"]:
         """Return what the radiance fields are given at points of the scene (metres)."""
-        return self._sample_features(particles.without_padding())(queries[:, :, None])[:, :, 0]
+        return self._sample_features(particles.with_driven().without_padding())(queries[:, :, None])[:, :, 0]
 
     def _render(
         self,

@@ -158,7 +158,7 @@ class SplatRenderer(AbstractRenderer):
         seen = self._seen_scenery(particles, rays)
         if seen is not None and particles.moving is not None:
             particles = replace(particles, mask=particles.mask & particles.moving)
-        particles = particles.with_hidden_side()
+        particles = particles.with_hidden_side().with_driven()
         particles = particles.without_padding()
         require_finite(
             "Rendering",

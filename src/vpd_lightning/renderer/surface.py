@@ -132,7 +132,7 @@ class SurfaceRenderer(AbstractRenderer):
             NonFiniteError: when a particle or a ray is not finite.
             ValueError: when ``keys`` do not name one sample per member of the batch axis.
         """
-        particles = particles.without_padding()
+        particles = particles.with_driven().without_padding()
         require_finite(
             "Rendering",
             positions=particles.positions,
@@ -160,7 +160,7 @@ class SurfaceRenderer(AbstractRenderer):
     ) -> Float[Tensor, "batch query feature"]:
         """Return what the field is given at points of the scene (metres): there, all particles are candidates."""
         features = SampleFeatures(
-            particles.without_padding(),
+            particles.with_driven().without_padding(),
             num_neighbors=self.num_neighbors,
             kernel_radii=self.kernel_radii,
             kernel_bandwidths=self.kernel_bandwidths,

@@ -21,7 +21,8 @@ def mapped(particles: Particles, function: Callable[[Tensor], Tensor]) -> Partic
 def member(particles: Particles, index: int) -> Particles:
     """Return one member of the batch, as a batch of one."""
     scenery = None if particles.scenery is None else particles.scenery[index : index + 1]
-    return replace(mapped(particles, lambda values: values[index : index + 1]), scenery=scenery)
+    driven = None if particles.driven is None else particles.driven[index : index + 1]
+    return replace(mapped(particles, lambda values: values[index : index + 1]), scenery=scenery, driven=driven)
 
 
 def reordered(particles: Particles, order: Int[Tensor, " particle"]) -> Particles:
@@ -35,8 +36,13 @@ def first(particles: Particles, count: int) -> Particles:
 
 
 def shifted(particles: Particles) -> Particles:
-    """Return the particles somewhere else in the world."""
-    return replace(particles, positions=particles.positions + particles.positions.new_tensor(SHIFT))
+    """Return the particles, and what is driven, somewhere else in the world."""
+    shift = particles.positions.new_tensor(SHIFT)
+    driven = particles.driven
+    if driven is not None:
+        there = None if driven.next_positions is None else driven.next_positions + shift
+        driven = replace(driven, positions=driven.positions + shift, next_positions=there)
+    return replace(particles, positions=particles.positions + shift, driven=driven)
 
 
 def shifted_rays(rays: Rays) -> Rays:
@@ -76,7 +82,8 @@ def padded_inside(particles: Particles) -> Particles:
         return None if values[0] is None else torch.cat(values, dim=1)
 
     names = [item.name for item in fields(Particles) if item.name not in OTHER_AXES]
-    return _with_padding_masked(Particles(**{name: joined(name) for name in names}, scenery=particles.scenery))
+    wide = Particles(**{name: joined(name) for name in names}, scenery=particles.scenery, driven=particles.driven)
+    return _with_padding_masked(wide)
 
 
 PADDINGS = {"far away": padded_far, "among the particles": padded_inside}

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from vpd_lightning.data.collate import driven_tensors
 from vpd_lightning.data.dataset import require_clips
 from vpd_lightning.data.frame_source import FrameSource
 from vpd_lightning.errors import ConfigError, EmptyWorkspaceError
@@ -90,4 +91,5 @@ def _frames(trajectory: FrameSource, time: int, views: Sequence[int]) -> RGBDFra
     rgb, depth = (
         torch.from_numpy(values) for values in (trajectory.rgb([time], views), trajectory.depth([time], views))
     )
-    return RGBDFrames(rgb.float() / 255, depth, Cameras(intrinsics, cam_to_world, trajectory.height, trajectory.width))
+    cameras = Cameras(intrinsics, cam_to_world, trajectory.height, trajectory.width)
+    return RGBDFrames(rgb.float() / 255, depth, cameras, driven_tensors(trajectory.driven([time])))

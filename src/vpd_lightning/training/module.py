@@ -189,7 +189,7 @@ class VPDModule(pl.LightningModule):
         """Roll one clip out and compare all its frames; returns the pictures for callbacks to draw."""
         clip = clip.to(self._parameter_dtype())
         target = clip.target
-        prediction = self.simulator.predict_frames(clip.context, target.cameras).float()
+        prediction = self.simulator.predict_frames(clip.context, target.cameras, target.driven).float()
         if not torch.isfinite(prediction).all():
             raise NonFiniteError(
                 f"The prediction for {clip.name} is not finite, after step {self.global_step}.\n"

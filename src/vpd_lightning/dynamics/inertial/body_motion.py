@@ -1,6 +1,6 @@
 """How bodies move in one step: shift, turn and stretch, and what a push at a point does to all three."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -37,6 +37,10 @@ class BodyMotion:
             strains=self.strains + change.strains,
         )
 
+    def first(self, count: int) -> "BodyMotion":
+        """Return the motion of the first bodies."""
+        return BodyMotion(*(getattr(self, item.name)[:, :count] for item in fields(self)))
+
     def deformation(self) -> Float[Tensor, "batch body 3 3"]:
         """Return (stretch + strain) stretch^-1, identity for a rigid body."""
         return torch.linalg.solve(self.stretches.mT, (self.stretches + self.limited_strains()).mT).mT
@@ -57,6 +61,13 @@ class BodyMotion:
     ) -> Float[Tensor, "batch point 3"]:
         """Return where offsets of points from the centres of their bodies point after the step."""
         return rotate(matrices_of(rotation_from_spin(self.spins) @ self.deformation(), bodies), offsets)
+
+    def carried(
+        self, positions: Float[Tensor, "batch point 3"], bodies: Int[Tensor, "batch point"]
+    ) -> Float[Tensor, "batch point 3"]:
+        """Return where points of bodies are after the step (metres)."""
+        offsets = positions - vectors_of(self.centers, bodies)
+        return vectors_of(self.centers + self.displacements, bodies) + self.turned(offsets, bodies)
 
     def following_stretches(self) -> tuple[Tensor, Tensor]:
         """Return stretch and strain after the step, turned with the body."""

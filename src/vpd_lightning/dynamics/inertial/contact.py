@@ -32,6 +32,10 @@ class Resolved:
     onward: BodyMotion
     touching: Bool[Tensor, "batch body 1"]
 
+    def first(self, count: int) -> "Resolved":
+        """Return that of the first bodies."""
+        return Resolved(self.step.first(count), self.onward.first(count), self.touching[:, :count])
+
 
 @dataclass(frozen=True)
 class _Touch:
@@ -78,7 +82,7 @@ def nearest_static_contacts(
     particle, or beyond ``far`` metres, the distance is ``far`` and the normal zero: no contact.
     """
     oriented = static_mask & (static_normals.square().sum(dim=-1) > 0.5)
-    index, exists = _nearest(probes, static_positions, oriented[:, None])
+    index, exists = nearest_usable(probes, static_positions, oriented[:, None])
     normals, offsets = vectors_of(static_normals, index), probes - vectors_of(static_positions, index)
     distances = (offsets * normals).sum(dim=-1)
     lateral = (offsets - distances[..., None] * normals).square().sum(dim=-1).clamp(min=1e-12).sqrt()
@@ -105,7 +109,7 @@ def nearest_body_contacts(
     bodies = torch.where(is_owned, points.bodies, -1)
     oriented = is_owned & (normals.square().sum(dim=-1) > 0.5)
     different = (bodies[:, :, None] != bodies[:, None]) & oriented[:, None] & is_owned[:, :, None]
-    other, exists = _nearest(positions, positions, different)
+    other, exists = nearest_usable(positions, positions, different)
     offset = positions - vectors_of(positions, other)
     height = (offset * vectors_of(normals, other)).sum(dim=-1)
     beside = offset.square().sum(dim=-1) - height.square()
@@ -150,6 +154,10 @@ class ContactSolver:
     so that momentum is kept. The velocity carried to the next step has no component into the surface; of the approach
     speed above ``rest_speed`` (metres per step) the share ``restitution`` is given back. Probes that were deeper than
     ``max_depth`` (metres) before the step are left alone: their surface is not to be trusted.
+
+    The last ``num_driven`` bodies are driven parts of infinite mass. They move fast and nothing takes their impulse, so
+    a push at the deepest probe alone would turn what they meet face to face: it acts at the mean of all probes that
+    penetrate, the deeper ones more.
     """
 
     def __init__(
@@ -161,10 +169,12 @@ class ContactSolver:
         materials: Materials,
         masses: Float[Tensor, "batch body 1"],
         rest_speed: float,
+        num_driven: int = 0,
     ):
         self.points, self.own = points, points.bodies
         self.offsets = points.positions - vectors_of(centers, self.own)
         self.inertia, self.materials, self.masses, self.rest_speed = inertia, materials, masses, rest_speed
+        self.num_driven = num_driven
 
     def resolve(
         self,
@@ -246,13 +256,17 @@ class ContactSolver:
         )
         # Both bodies are pushed at one place, between the two points: at two, they would be turned out of nothing.
         place = (vectors_of(there, probe) + vectors_of(there, torch.gather(contacts.other, 1, probe))) / 2
+        normals = vectors_of(facing, probe)
+        if self.num_driven:
+            middles = (there + vectors_of(there, contacts.other)) / 2
+            place, normals = self._spread(place, normals, middles, facing, torch.where(usable, -gaps[:, None, None], 0))
         centers = motion.centers + motion.displacements
         pairs = _Pairs(
             first=first,
             second=second,
             first_arms=place - vectors_of(centers, first),
             second_arms=place - vectors_of(centers, second),
-            normals=vectors_of(facing, probe),
+            normals=normals,
             approach=torch.zeros_like(depth),
             is_active=depth > 0,
         )
@@ -265,6 +279,26 @@ class ContactSolver:
         friction = self._pair_mean(self.materials.friction, pairs)
         drag = torch.minimum(0.5 * speed / self._pair_response(pairs, direction), friction * impulse)
         return self._pair_pushed(motion, pairs, impulse * pairs.normals - drag * direction), pairs
+
+    def _spread(
+        self,
+        place: Tensor,
+        normals: Tensor,
+        middles: Tensor,
+        facing: Tensor,
+        depths: Float[Tensor, "batch body body any"],
+    ) -> tuple[Tensor, Tensor]:
+        """Return place and normal of each pair's contact; with a driven part, means over all probes that penetrate."""
+        count = depths.shape[1]
+        weights = torch.relu(depths).flatten(1, 2)
+        weights = (weights / weights.amax(dim=-1, keepdim=True).clamp(min=1e-12)).square()
+        total = weights.sum(dim=-1, keepdim=True)
+        weights = weights / total.clamp(min=1e-12)
+        is_driven = torch.arange(count, device=depths.device) >= count - self.num_driven
+        chosen = ((is_driven[:, None] | is_driven).flatten()[:, None]) & (total > 0)
+        mean = weights @ facing
+        length = mean.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+        return torch.where(chosen, weights @ middles, place), torch.where(chosen, mean / length, normals)
 
     def _bounce_apart(self, motion: BodyMotion, pairs: "_Pairs") -> BodyMotion:
         """Give back a share of the approach of two bodies, or at least take all of it away."""
@@ -284,7 +318,7 @@ class ContactSolver:
             self.inertia.gathered(index).response(arm, directions) / vectors_of(self.masses, index)
             for index, arm in pairs.sides()
         ]
-        return each[0] + each[1]
+        return (each[0] + each[1]).clamp(min=1e-12)  # of two driven parts it is zero
 
     def _pair_pushed(self, motion: BodyMotion, pairs: "_Pairs", impulses: Tensor) -> BodyMotion:
         for sign, (index, arm) in zip((1, -1), pairs.sides(), strict=True):
@@ -294,7 +328,7 @@ class ContactSolver:
 
 
 @torch.no_grad()
-def _nearest(
+def nearest_usable(
     queries: Float[Tensor, "batch query 3"],
     points: Float[Tensor, "batch point 3"],
     usable: Bool[Tensor, "batch any point"],

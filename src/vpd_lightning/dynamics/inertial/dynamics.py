@@ -1,5 +1,6 @@
 """Inertial dynamics: what moves keeps moving, as rigid or soft bodies; networks learn forces and materials."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,12 +13,18 @@ from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.inertial.body_forces import BodyForces
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, body_volumes, matrices_of, vectors_of
 from vpd_lightning.dynamics.inertial.contact import (
-    BodyContacts,
-    ContactPoints,
     ContactSolver,
     Resolved,
-    nearest_body_contacts,
     nearest_static_contacts,
+)
+from vpd_lightning.dynamics.inertial.contact_points import between_bodies, contact_points, pushed_surface
+from vpd_lightning.dynamics.inertial.driven_bodies import (
+    DrivenBodies,
+    driven_bodies,
+    joined_inertia,
+    joined_materials,
+    joined_motion,
+    meet,
 )
 from vpd_lightning.dynamics.inertial.first_motion import find_first_motion, gather_index, movable, observed, put, take
 from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity, Surfels
@@ -29,10 +36,6 @@ from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
 from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles
-
-_PAIR_REACH = 1.5
-"""Spacings beside the nearest particle of another body within which that still locates its surface."""
-
 
 _BOUNCE_SHARE = 0.3
 """Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, so that bodies come to rest."""
@@ -54,6 +57,9 @@ class InertialDynamics(AbstractDynamics):
 
     With ``guess_hidden`` (and ``keep_shape`` and ``carry_memory``) the renderer gets what no camera saw of a body, too:
     mirror images through its centre (``Particles.hidden_side``).
+
+    With ``has_driven``, driven points are rigid parts of infinite mass that push bodies, with a friction of their own
+    that is learned (``driven_bodies``); nothing pushes them.
 
     For comparisons, each part can be left out: with ``first_velocity`` null bodies start at rest; with ``keep_shape``
     false every particle goes on with its own velocity, to which it adds what its body's changes by; with
@@ -92,6 +98,7 @@ class InertialDynamics(AbstractDynamics):
         shadow_scales: Sequence[float] | None,
         extent_weight: float,
         guess_hidden: bool,
+        has_driven: bool = False,
     ):
         super().__init__()
         for name, value in (("num_bodies", num_bodies), ("num_probes", num_probes)):
@@ -126,6 +133,8 @@ class InertialDynamics(AbstractDynamics):
         self.moving_shading = MovingShading(feature_dim=feature_dim, hidden_dim=hidden_dim)
         is_guessing = guess_hidden and keep_shape and carry_memory
         self.hidden_guess = HiddenGuess(feature_dim=feature_dim) if is_guessing else None
+        self.has_driven = has_driven
+        self.log_driven_friction = nn.Parameter(torch.tensor(math.log(0.3))) if has_driven else None
         self.static_shading = None
         if shadow_scales is not None:
             self.static_shading = StaticShading(feature_dim=feature_dim, hidden_dim=hidden_dim, scales=shadow_scales)
@@ -231,13 +240,16 @@ class InertialDynamics(AbstractDynamics):
     def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
         positions = take(current.positions, memory.index) - memory.origin
         static_positions = take(current.positions, memory.static_index) - memory.origin
-        resolved = self._resolved(positions, static_positions, current.normals, memory)  # type: ignore[arg-type]
+        driven = None
+        if self.has_driven and current.driven is not None and current.driven.mask.any():
+            driven = driven_bodies(current.driven, memory.origin)
+        resolved = self._resolved(positions, static_positions, current.normals, memory, driven)  # type: ignore[arg-type]
         step, onward = self._rested(resolved)
         own = memory.own
-        moved = _carried(step, positions, own)
+        moved = step.carried(positions, own)
         velocities = memory.velocities
         if not self.keep_shape:
-            velocities = velocities + moved - _carried(memory.motion, positions, own)
+            velocities = velocities + moved - memory.motion.carried(positions, own)
             moved = positions + velocities
         following = torch.where(memory.mask[..., None], moved, positions)
         rotations = rotation_from_spin(step.spins)
@@ -257,7 +269,12 @@ class InertialDynamics(AbstractDynamics):
         return replace(current, positions=all_positions, features=features, normals=normals, hidden_side=side), memory
 
     def _resolved(
-        self, positions: Tensor, static_positions: Tensor, normals: Tensor, memory: InertialMemory
+        self,
+        positions: Tensor,
+        static_positions: Tensor,
+        normals: Tensor,
+        memory: InertialMemory,
+        driven: DrivenBodies | None,
     ) -> Resolved:
         """Return the step after forces, elastic return and contact."""
         probes = slice(0, self.num_probes)
@@ -271,7 +288,7 @@ class InertialDynamics(AbstractDynamics):
         offsets = probe_positions - vectors_of(memory.motion.centers, own)
         moved = vectors_of(memory.motion.displacements, own) + memory.motion.turned(offsets, own) - offsets
         statics = (static_positions, take(normals, memory.static_index), memory.static_mask, self.contact_reach)
-        points = self._contact_points(probe_positions, memory, members)
+        points = contact_points(probe_positions, memory, members, self.mirror_hidden)
         contacts = nearest_static_contacts(points.positions, *statics)
         motion = self.forces(
             probe_positions,
@@ -283,48 +300,35 @@ class InertialDynamics(AbstractDynamics):
             inertia,
         )
         motion = replace(motion, strains=_elastic(motion, materials))
+        between, masses, num_bodies = between_bodies(points, memory), memory.masses, memory.masses.shape[1]
+        met = None
+        if driven is not None:
+            surface = pushed_surface(positions, memory, self.mirror_hidden)
+            met = meet(driven, surface, motion, points, contacts, between)
+        if driven is not None and met is not None:
+            assert self.log_driven_friction is not None
+            points, contacts, between = met.points, met.static, met.between
+            count = driven.members.shape[1]
+            motion, inertia = joined_motion(motion, driven.motion), joined_inertia(inertia, count)
+            materials = joined_materials(materials, self.log_driven_friction.exp(), count)
+            masses = torch.cat([masses, torch.full_like(masses[:, :1], torch.inf).expand(-1, count, -1)], dim=1)
         solver = ContactSolver(
             points=points,
-            centers=memory.motion.centers,
+            centers=motion.centers,
             inertia=inertia,
             materials=materials,
-            masses=memory.masses,
+            masses=masses,
             rest_speed=_BOUNCE_SHARE * self.force_scale,
+            num_driven=masses.shape[1] - num_bodies,
         )
-        return solver.resolve(
+        resolved = solver.resolve(
             motion,
             contacts,
-            self._between(points, memory),
+            between,
             num_iterations=self.num_contact_iterations,
             max_depth=self.max_contact_depth,
         )
-
-    def _contact_points(self, positions: Tensor, memory: InertialMemory, members: Tensor) -> ContactPoints:
-        """Return what may touch: the probes and, where their hidden sides are to be guessed, their mirror images.
-
-        Cameras above a body do not see what it will land on. Most bodies are alike on both sides of their centre.
-        """
-        normals = memory.normals[:, : self.num_probes]
-        if not self.mirror_hidden:
-            return ContactPoints(positions, normals, members)
-        centers = vectors_of(memory.motion.centers, memory.own[:, : self.num_probes])
-        mirrored = members * memory.mirrored[:, None, : self.num_probes]
-        return ContactPoints(
-            torch.cat([positions, 2 * centers - positions], dim=1),
-            torch.cat([normals, -normals], dim=1),
-            torch.cat([members, mirrored.to(members.dtype)], dim=2),
-        )
-
-    @staticmethod
-    def _between(points: ContactPoints, memory: InertialMemory) -> BodyContacts | None:
-        """Return where bodies may touch each other; None where there is nothing to touch, which saves the work."""
-        if points.members.shape[1] == 1:
-            return None
-        # No deeper than a third of a body: what lies deeper came from the other side.
-        size = (memory.masses / memory.materials.density).detach().clamp(min=1e-27) ** (1 / 3)
-        depth = (points.members * size).sum(dim=1) / 3
-        found = nearest_body_contacts(points, _PAIR_REACH * memory.spacing, depth)
-        return found if bool(found.known.any()) else None
+        return resolved if met is None else resolved.first(num_bodies)
 
     def _rested(self, resolved: Resolved) -> tuple[BodyMotion, BodyMotion]:
         """Stop bodies in contact that move by less than ``rest_share`` of ``force_scale`` in a step.
@@ -356,12 +360,6 @@ class InertialDynamics(AbstractDynamics):
         static = static + (shade - memory.static_shade)
         features = put(current.features, memory.index, moving, memory.mask)
         return put(features, memory.static_index, static, memory.static_mask)
-
-
-def _carried(motion: BodyMotion, positions: Tensor, own: Tensor) -> Float[Tensor, "batch moving 3"]:
-    """Return where points of bodies are after the step."""
-    offsets = positions - vectors_of(motion.centers, own)
-    return vectors_of(motion.centers + motion.displacements, own) + motion.turned(offsets, own)
 
 
 def _first_motion(positions: Tensor, displacements: Tensor, shares: Tensor, centers: Tensor) -> BodyMotion:

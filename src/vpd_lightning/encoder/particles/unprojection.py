@@ -12,6 +12,7 @@ from vpd_lightning.encoder.particles.scenery import scenery_of
 from vpd_lightning.errors import EmptyWorkspaceError
 from vpd_lightning.geometry import workspace
 from vpd_lightning.geometry.cameras import unproject
+from vpd_lightning.geometry.driven_pixels import nearest_pixels, shows_driven
 from vpd_lightning.geometry.normals import depth_normals
 from vpd_lightning.geometry.occluders import occluders_of
 from vpd_lightning.geometry.workspace import inside_workspace
@@ -30,12 +31,13 @@ class UnprojectingEncoder(AbstractEncoder):
     ``color_features`` the first three features are the colours of the pixels, whatever the network predicts. With
     ``same_pixels`` the particles of both context frames are the same pixels, wherever these lie in the workspace. With
     ``has_scenery`` every pixel that stands still, in the workspace or not, is a point of the particles' ``scenery``.
+    With ``has_driven`` pixels that show what is driven become neither: its own points get their features.
     """
 
-    # Paper: moving_fraction, background, use_normals, color_features and same_pixels are ours; the paper has none of
-    # them (None, None and three times False). Its 2^14 particles are all pixels of a camera, or many of a body's. If
-    # only a few are drawn, independently in both frames, the mean of a body's particles moves by chance about as far as
-    # the body does in a step.
+    # Paper: moving_fraction, background, use_normals, color_features, same_pixels and has_driven are ours; the paper
+    # has none of them (None, None and four times False). Its 2^14 particles are all pixels of a camera, or many of a
+    # body's. If only a few are drawn, independently in both frames, the mean of a body's particles moves by chance
+    # about as far as the body does in a step.
 
     # What the error message names where no pixel lies in the workspace.
     _empty_advice = "Check depth (metres), camera poses (camera to world, OpenCV axes) and scene.workspace_min/max."
@@ -54,6 +56,7 @@ class UnprojectingEncoder(AbstractEncoder):
         color_features: bool,
         same_pixels: bool,
         has_scenery: bool,
+        has_driven: bool = False,
     ):
         super().__init__()
         if num_particles < 1:
@@ -77,7 +80,9 @@ class UnprojectingEncoder(AbstractEncoder):
         self.use_normals = use_normals
         self.color_features = color_features
         self.same_pixels = same_pixels
-        self.has_scenery = has_scenery
+        self.has_scenery, self.has_driven = has_scenery, has_driven
+        # How what is driven looks where no camera sees it yet; a colour between black and white.
+        self.unseen_driven = nn.Parameter(torch.full((feature_dim,), 0.5)) if has_driven else None
 
     @staticmethod
     def _colors(frames: RGBDFrames) -> Float[Tensor, "batch view height width 3"]:
@@ -109,11 +114,13 @@ class UnprojectingEncoder(AbstractEncoder):
         Raises:
             EmptyWorkspaceError: no pixel of a batch member lies in the workspace.
         """
+        on_driven = self._on_driven(frames)
         judged, frames = self._restored(frames)
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
         measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
+        driven_pixels, far, measured = measured & on_driven, ~measured & ~on_driven, measured & ~on_driven
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
-        moving, still, far = None, measured, ~measured
+        moving, still = None, measured
         if self.background is not None:
             dynamic_mask = self.background(_cropped(judged, candidates))
             trusted = self.background.trusted(judged, dynamic_mask).flatten(1)
@@ -130,12 +137,22 @@ class UnprojectingEncoder(AbstractEncoder):
         everywhere = points
         points = torch.where(candidates[..., None], points, torch.zeros_like(points))  # no NaN through padding
 
-        def take(values: Tensor) -> Tensor:
+        def take(values: Tensor, index: Tensor = index) -> Tensor:
             return torch.gather(values, 1, index[..., None].expand(-1, -1, values.shape[-1]))
 
-        colors, features = take(frames.rgb.flatten(1, 3)), features_at(index)
+        driven = frames.driven if self.has_driven else None
+        wanted = index
+        if driven is not None:
+            wanted, is_seen = nearest_pixels(driven, everywhere, driven_pixels)
+            wanted = torch.cat([index, wanted], dim=1)
+        colors, features = take(frames.rgb.flatten(1, 3), wanted), features_at(wanted)
         if self.color_features:
             features = torch.cat([colors.to(features), features[..., 3:]], dim=-1)
+        if driven is not None:
+            assert self.unseen_driven is not None
+            looks = torch.where(is_seen[..., None], features[:, index.shape[1] :], self.unseen_driven)
+            driven = replace(driven, features=looks * driven.mask[..., None])
+            colors, features = colors[:, : index.shape[1]], features[:, : index.shape[1]]
         particles = Particles(
             positions=take(points) * valid[..., None],
             features=features * valid[..., None],
@@ -143,12 +160,18 @@ class UnprojectingEncoder(AbstractEncoder):
             colors=colors,
             moving=None if moving is None else torch.gather(moving, 1, index) & valid,
             normals=take(normals) if self.use_normals and normals is not None else None,
+            driven=driven,
         )
         # That of the current frame is drawn; the frame before it has no other.
         if not self.has_scenery or purpose == "previous":
             return particles
         assert normals is not None
         return replace(particles, scenery=scenery_of(frames, everywhere, normals, still, far, occluders_of(particles)))
+
+    def _on_driven(self, frames: RGBDFrames) -> Bool[Tensor, "batch point"]:
+        if not self.has_driven:
+            return torch.zeros_like(frames.depth, dtype=torch.bool).flatten(1)
+        return shows_driven(frames).flatten(1)
 
     def _restored(self, frames: RGBDFrames) -> tuple[RGBDFrames, RGBDFrames]:
         """Return the frames by which it is judged what moves, and those whose depth places the particles.
@@ -178,6 +201,7 @@ class UnprojectingEncoder(AbstractEncoder):
         assert self.background is not None
         points = unproject(frames.depth, frames.cameras).flatten(1, 3)
         measured = (torch.isfinite(frames.depth) & (frames.depth > 0)).flatten(1)
+        measured = measured & ~self._on_driven(frames)
         candidates = measured & inside_workspace(points, self.workspace_min, self.workspace_max)
         moving = self.background(_cropped(judged, candidates)) & candidates.view_as(frames.depth)
         return moving, candidates.view_as(frames.depth)

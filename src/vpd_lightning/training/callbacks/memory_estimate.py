@@ -79,9 +79,9 @@ def first_clip(batch: VideoBatch | ViewBatch, num_steps: int = 0) -> VideoBatch 
     steps = [min(step, length - 1) for step in range(max(length, num_steps))]
     rays = replace(batch.rays, origins=batch.rays.origins[:1, steps], directions=batch.rays.directions[:1, steps])
     future = None if batch.future is None else batch.future[:1, steps]
-    return replace(
-        batch, context=batch.context[:1], rays=rays, rgbs=batch.rgbs[:1, steps], keys=keys, clips=clips, future=future
-    )
+    driven = None if batch.driven is None else batch.driven[:1, steps]
+    context, rgbs = batch.context[:1], batch.rgbs[:1, steps]
+    return replace(batch, context=context, rays=rays, rgbs=rgbs, keys=keys, clips=clips, future=future, driven=driven)
 
 
 def _taken_by(module: VPDModule, batch: VideoBatch | ViewBatch) -> int | None:

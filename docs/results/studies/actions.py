@@ -1,0 +1,150 @@
+"""What the action is worth: motion of pushed bodies with the true action, another recording's, none, and without any.
+
+``python -m docs.results.studies.actions OUT.json DATA NAME=CKPT ... [--split test --starts 0 6 12]`` measures every
+checkpoint on bodies whose true centre moves by more than ``MOVED`` within 16 steps. A model that takes actions is
+given the true motion (``true``), that of another clip, carried to where the pusher is (``shuffled``), and none
+(``still``: the pusher stays). Errors are those of ``vpd-eval``: of the centre in centimetres, of the orientation in
+degrees, by horizon; beside them what needs no model. Intervals: 2,000 resamples of trajectories.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vpd_lightning.data.clip import Clip, read_clip
+from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
+from vpd_lightning.evaluation.prediction import encode_clip, roll_out_clip, takes_actions
+from vpd_lightning.evaluation.references import median_displacements
+from vpd_lightning.files import AtomicPath
+from vpd_lightning.loading import LoadedModel, load_model
+from vpd_lightning.types import Driven
+
+STEPS = (1, 2, 4, 8, 16, 32)
+MOVED = 0.01  # metres
+TOUCHED_WITHIN = 16  # steps
+REFERENCES = {"nothing moves": "copy", "true velocity": "velocity", "best constant": "constant"}
+_NUM_RESAMPLES = 2000
+
+
+def variants(model: LoadedModel, clip: Clip, other: Clip) -> dict[str, Clip]:
+    """Return the clip with the actions that the model is given."""
+    if clip.driven is None or other.driven is None or not takes_actions(model.simulator):
+        return {"none": clip}
+    here, there = clip.context_driven, other.context_driven
+    assert here is not None and there is not None and clip.target_driven is not None
+    now, moved = here.positions[-1:], other.target_driven
+    assert moved is not None
+    elsewhere = now + (moved.positions - there.positions[-1:])
+    still = now.expand_as(moved.positions)
+    return {
+        "true": clip,
+        "shuffled": _with_positions(clip, here, elsewhere),
+        "still": _with_positions(clip, here, still),
+    }
+
+
+def _with_positions(clip: Clip, context: Driven, positions: torch.Tensor) -> Clip:
+    assert clip.driven is not None
+    return replace(clip, driven=replace(clip.driven, positions=torch.cat([context.positions, positions])))
+
+
+def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) -> dict[str, Any]:
+    """Return the errors of one model with each kind of action."""
+    margin = model.config["protocol"]["body_margin"]
+    constants = median_displacements(sorted((data / "train").glob("*.h5")), starts, max(STEPS))
+    files = sorted((data / split).glob("*.h5"))
+    rows: dict[str, list[NDArray[np.float64]]] = {}
+    trajectory: list[int] = []
+    with torch.no_grad():
+        for number, path in enumerate(files):
+            for start in starts:
+                clip = read_clip(path, number, start, max(STEPS))
+                other = read_clip(files[(number + 1) % len(files)], number, start, max(STEPS))
+                poses = clip.poses(max(STEPS))[..., :3]
+                touched = (poses[: TOUCHED_WITHIN + 1] - poses[:1]).norm(dim=-1).amax(dim=0) > MOVED
+                if not bool(touched.any()):
+                    continue
+                scene = encode_clip(model.simulator, clip, model.input_views)
+                for name, shown in variants(model, clip, other).items():
+                    states = roll_out_clip(model.simulator, scene, shown, max(STEPS))
+                    motion, _ = clip_motion(clip, trajectory_of(scene.current, states), margin, constants.get(start))
+                    keep = touched[: len(motion["centroid_error"])]
+                    for metric, values in motion.items():
+                        rows.setdefault(f"{name}/{metric}", []).append(values[keep].numpy())
+                trajectory += [number] * int(keep.sum())
+    return _summary({name: np.concatenate(values) for name, values in rows.items()}, np.array(trajectory))
+
+
+def _summary(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]) -> dict[str, Any]:
+    at = [step - 1 for step in STEPS]
+    found: dict[str, Any] = {"bodies": len(trajectory), "trajectories": len(np.unique(trajectory))}
+    for name in sorted({key.split("/")[0] for key in rows}):
+        part = {}
+        for metric, scale in (("centroid_error", 100.0), ("orientation_error", 1.0), ("size_ratio", 1.0)):
+            if f"{name}/{metric}" in rows:
+                part[metric] = _means(scale * rows[f"{name}/{metric}"][:, at], trajectory)
+        found[name] = part
+    first = sorted({key.split("/")[0] for key in rows})[0]
+    found["references"] = {
+        title: _means(100 * rows[f"{first}/centroid_error_{end}"][:, at], trajectory)
+        for title, end in REFERENCES.items()
+        if f"{first}/centroid_error_{end}" in rows
+    }
+    return found
+
+
+def _means(values: NDArray[np.float64], trajectory: NDArray[np.int64]) -> dict[str, list[float]]:
+    """Return mean and 95 % interval by step: [mean, low, high]; resampled by trajectory."""
+    draw = np.random.default_rng(0)
+    numbers = np.unique(trajectory)
+    sums = np.stack([np.nansum(values[trajectory == n], axis=0) for n in numbers])
+    counts = np.stack([np.isfinite(values[trajectory == n]).sum(axis=0) for n in numbers])
+    chosen = draw.integers(len(numbers), size=(_NUM_RESAMPLES, len(numbers)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means = sums[chosen].sum(axis=1) / counts[chosen].sum(axis=1)
+        mean = sums.sum(axis=0) / counts.sum(axis=0)
+    low, high = np.nanpercentile(means, [2.5, 97.5], axis=0)
+    return {str(step): [float(mean[i]), float(low[i]), float(high[i])] for i, step in enumerate(STEPS)}
+
+
+def main() -> None:
+    """Measure the models and print a table of each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("models", nargs="+", help="NAME=CKPT")
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--starts", type=int, nargs="+", default=[0, 6, 12])
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    result = json.loads(options.out.read_text()) if options.out.is_file() else {}
+    for words in options.models:
+        name, ckpt = words.split("=", 1)
+        model = load_model(ckpt)
+        result[name] = measured(model, options.data, options.split, options.starts)
+        with AtomicPath(options.out) as path:
+            path.write_text(json.dumps(result, indent=1) + "\n")
+        print_table(name, result[name])
+
+
+def print_table(name: str, found: dict[str, Any]) -> None:
+    """Print the centre's error of each kind of action."""
+    print(f"{name}: {found['bodies']} bodies of {found['trajectories']} trajectories; cm after {STEPS} steps")
+    parts = {
+        kind: part["centroid_error"]
+        for kind, part in found.items()
+        if isinstance(part, dict) and "centroid_error" in part
+    }
+    for kind, row in {**parts, **found["references"]}.items():
+        print(f"  {kind:14}", " ".join(f"{row[str(step)][0]:6.2f}" for step in STEPS))
+
+
+if __name__ == "__main__":
+    main()
