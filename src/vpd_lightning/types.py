@@ -222,8 +222,8 @@ class Particles(_Border):
     where unknown) are observations carried along for a dynamics that uses them; the paper's does not. With ``scenery``
     particles that are not ``moving`` are for the dynamics alone: a renderer draws the scenery in their place.
     ``occluders`` cast the shadows in place of moving particles: in training, what was seen to move at that time.
-    ``hidden_side`` is what a dynamics guesses of them beyond what was seen. ``driven`` are points whose motion is given,
-    such as a robot's; they are no particles and have an axis of their own.
+    ``hidden_side`` is what a dynamics guesses of them beyond what was seen. ``driven`` are points whose motion is
+    given, such as a robot's; they are no particles and have an axis of their own.
     """
 
     positions: Float[Tensor, "*batch particle 3"]

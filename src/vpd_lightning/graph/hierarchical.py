@@ -34,8 +34,8 @@ class HierarchicalGraph:
 
     The edges at particles are a table, a fixed number for each particle with padding where there is no abstract node
     in reach; both directions between current particles and abstract nodes share one. The edges among abstract nodes
-    are sorted by receiver. ``is_covered`` tells which current particles have an abstract node within reach. Driven points,
-    where the current particles have some, send to abstract nodes and receive nothing.
+    are sorted by receiver. ``is_covered`` tells which current particles have an abstract node within reach. Driven
+    points, where the current particles have some, send to abstract nodes and receive nothing.
     """
 
     abstract_index: Int64[Tensor, " abstract_node"]

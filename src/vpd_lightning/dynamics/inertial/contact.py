@@ -1,6 +1,7 @@
 """Contact: bodies kept out of what stands still and out of one another, with friction and bounce."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, Push, matrices_of, vectors_of
 from vpd_lightning.dynamics.inertial.materials import Materials
+from vpd_lightning.dynamics.inertial.nearest import nearest_usable
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rotate, rotation_from_spin
 
 
@@ -55,9 +57,9 @@ class ContactPoints:
     normals: Float[Tensor, "batch probe 3"]
     members: Float[Tensor, "batch body probe"]
 
-    @property
+    @cached_property
     def bodies(self) -> Int[Tensor, "batch probe"]:
-        """Return the body of each point; 0 where it has none."""
+        """The body of each point; 0 where it has none."""
         return self.members.argmax(dim=1)
 
 
@@ -82,7 +84,7 @@ def nearest_static_contacts(
     particle, or beyond ``far`` metres, the distance is ``far`` and the normal zero: no contact.
     """
     oriented = static_mask & (static_normals.square().sum(dim=-1) > 0.5)
-    index, exists = nearest_usable(probes, static_positions, oriented[:, None])
+    index, exists = nearest_usable(probes, static_positions, oriented)
     normals, offsets = vectors_of(static_normals, index), probes - vectors_of(static_positions, index)
     distances = (offsets * normals).sum(dim=-1)
     lateral = (offsets - distances[..., None] * normals).square().sum(dim=-1).clamp(min=1e-12).sqrt()
@@ -108,8 +110,8 @@ def nearest_body_contacts(
     positions, normals, is_owned = points.positions, points.normals, points.members.any(dim=1)
     bodies = torch.where(is_owned, points.bodies, -1)
     oriented = is_owned & (normals.square().sum(dim=-1) > 0.5)
-    different = (bodies[:, :, None] != bodies[:, None]) & oriented[:, None] & is_owned[:, :, None]
-    other, exists = nearest_usable(positions, positions, different)
+    other, exists = nearest_usable(positions, positions, oriented, (bodies, bodies))
+    exists = exists & is_owned
     offset = positions - vectors_of(positions, other)
     height = (offset * vectors_of(normals, other)).sum(dim=-1)
     beside = offset.square().sum(dim=-1) - height.square()
@@ -325,30 +327,6 @@ class ContactSolver:
             push = self.inertia.gathered(index).push(arm, sign * impulses / vectors_of(self.masses, index))
             motion = motion.pushed(_summed(push, index, self.points.members.shape[1]))
         return motion
-
-
-@torch.no_grad()
-def nearest_usable(
-    queries: Float[Tensor, "batch query 3"],
-    points: Float[Tensor, "batch point 3"],
-    usable: Bool[Tensor, "batch any point"],
-) -> tuple[Int[Tensor, "batch query"], Bool[Tensor, "batch query"]]:
-    """Return the nearest usable point of each query and whether there is one.
-
-    The product form of the squared distance, in half the time of differences, finds the two nearest, and differences
-    decide between them: two points may be equally far, and rounding must not choose.
-    """
-    origin = queries.mean(dim=1, keepdim=True)
-    local, others = queries - origin, points - origin
-    order = torch.baddbmm(others.square().sum(dim=-1)[:, None], local, others.mT, alpha=-2)
-    lowest, index = order.masked_fill(~usable, torch.inf).topk(min(2, order.shape[-1]), dim=-1, largest=False)
-    index = index.sort(dim=-1).values  # of equally far ones the first
-    gaps = queries[:, :, None] - vectors_of(points, index.flatten(1)).unflatten(1, index.shape[1:])
-    square = gaps.square().sum(dim=-1)
-    exists = torch.isfinite(lowest[..., :1])
-    chosen = torch.gather(usable.expand(order.shape), 2, index)
-    which = square.masked_fill(~chosen, torch.inf).argmin(dim=-1, keepdim=True)
-    return torch.gather(index, 2, which).squeeze(-1), exists.squeeze(-1)
 
 
 def _as_push(motion: BodyMotion) -> Push:

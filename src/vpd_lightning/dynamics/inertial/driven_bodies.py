@@ -7,8 +7,9 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, vectors_of
-from vpd_lightning.dynamics.inertial.contact import BodyContacts, ContactPoints, Contacts, nearest_usable
+from vpd_lightning.dynamics.inertial.contact import BodyContacts, ContactPoints, Contacts
 from vpd_lightning.dynamics.inertial.materials import Materials
+from vpd_lightning.dynamics.inertial.nearest import nearest_usable
 from vpd_lightning.dynamics.inertial.rigid_motion import fit_twists, weighted_sum
 from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.types import Driven
@@ -182,7 +183,7 @@ def _met_by_driven(bodies: DrivenBodies, surface: Surface, motion: BodyMotion) -
             start + part / num_parts * step
             for start, step in ((surface.positions, moves), (bodies.positions, bodies.displacements))
         )
-        index, exists = nearest_usable(queries, places, surface.is_usable[:, None])
+        index, exists = nearest_usable(queries, places, surface.is_usable)
         offsets = queries - vectors_of(places, index) + (bodies.displacements - vectors_of(moves, index)) / num_parts
         height = (offsets * vectors_of(surface.normals, index)).sum(dim=-1)
         beside = offsets.square().sum(dim=-1) - height.square()
@@ -200,7 +201,7 @@ def _met_by_bodies(
     """Return the driven point whose tangent plane each point of a body meets, and whether it meets one."""
     there = motion.carried(points.positions, points.bodies)
     usable = bodies.mask & (bodies.normals.square().sum(dim=-1) > 0.5)
-    nearest, exists = nearest_usable(points.positions, bodies.positions, usable[:, None])
+    nearest, exists = nearest_usable(points.positions, bodies.positions, usable)
     offsets = there - vectors_of(bodies.positions + bodies.displacements, nearest)
     height = (offsets * vectors_of(bodies.normals, nearest)).sum(dim=-1)
     beside = offsets.square().sum(dim=-1) - height.square()

@@ -17,7 +17,12 @@ from vpd_lightning.dynamics.inertial.contact import (
     Resolved,
     nearest_static_contacts,
 )
-from vpd_lightning.dynamics.inertial.contact_points import between_bodies, contact_points, pushed_surface
+from vpd_lightning.dynamics.inertial.contact_points import (
+    between_bodies,
+    body_sizes,
+    contact_points,
+    pushed_surface,
+)
 from vpd_lightning.dynamics.inertial.driven_bodies import (
     DrivenBodies,
     driven_bodies,
@@ -33,6 +38,11 @@ from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
 from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, fit_twists, rotate, rotation_from_spin
 from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
+from vpd_lightning.dynamics.inertial.static_surface import (
+    resting_clearances,
+    static_contacts,
+    static_surface,
+)
 from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles
@@ -60,6 +70,11 @@ class InertialDynamics(AbstractDynamics):
 
     With ``has_driven``, driven points are rigid parts of infinite mass that push bodies, with a friction of their own
     that is learned (``driven_bodies``); nothing pushes them.
+
+    With ``edge_reach`` (spacings of the static particles) a static surface ends that far beside its last particle, and
+    goes on under bodies; null: it goes on without end. A body that approaches the surface under it by less than
+    ``supported_speed`` (in ``force_scale``, per step) when it is first seen stands on it, whatever of its foot was seen
+    (``static_surface``).
 
     For comparisons, each part can be left out: with ``first_velocity`` null bodies start at rest; with ``keep_shape``
     false every particle goes on with its own velocity, to which it adds what its body's changes by; with
@@ -99,6 +114,8 @@ class InertialDynamics(AbstractDynamics):
         extent_weight: float,
         guess_hidden: bool,
         has_driven: bool = False,
+        edge_reach: float | None = None,
+        supported_speed: float = 0.0,
     ):
         super().__init__()
         for name, value in (("num_bodies", num_bodies), ("num_probes", num_probes)):
@@ -133,6 +150,12 @@ class InertialDynamics(AbstractDynamics):
         self.moving_shading = MovingShading(feature_dim=feature_dim, hidden_dim=hidden_dim)
         is_guessing = guess_hidden and keep_shape and carry_memory
         self.hidden_guess = HiddenGuess(feature_dim=feature_dim) if is_guessing else None
+        if edge_reach is not None and edge_reach <= 0 or supported_speed < 0:
+            raise ValueError(
+                "edge_reach must be positive or null and supported_speed not negative, "
+                f"got {edge_reach} and {supported_speed}"
+            )
+        self.edge_reach, self.supported_speed = edge_reach, supported_speed
         self.has_driven = has_driven
         self.log_driven_friction = nn.Parameter(torch.tensor(math.log(0.3))) if has_driven else None
         self.static_shading = None
@@ -173,7 +196,8 @@ class InertialDynamics(AbstractDynamics):
         if self.hidden_guess is not None:
             hidden = self.hidden_guess(seen, bodies, found.own, centers, mirrored, self.moving_shading)
         static_features = take(current.features, static_index)
-        return InertialMemory(
+        empty = torch.zeros_like(bodies[..., 0])
+        memory = InertialMemory(
             origin=origin,
             index=index,
             mask=mask,
@@ -197,7 +221,29 @@ class InertialDynamics(AbstractDynamics):
                 else self.static_shading(static_features, static_positions, seen.positions, mask)
             ),
             hidden=hidden,
+            surface=static_surface((seen.positions, seen.normals, mask), seen.positions, mask, None, empty),
         )
+        statics = (static_positions, take(current.normals, static_index), static_mask)  # type: ignore[arg-type]
+        return self._on_surface(current, memory, seen.positions, statics)
+
+    def _on_surface(
+        self, current: Particles, memory: InertialMemory, positions: Tensor, statics: tuple[Tensor, Tensor, Tensor]
+    ) -> InertialMemory:
+        """Find what of the static surface is hidden, where it ends, and which bodies rest on it."""
+        above, is_above = positions.detach(), memory.mask
+        if self.has_driven and current.driven is not None:
+            above = torch.cat([above, current.driven.positions - memory.origin], dim=1)
+            is_above = torch.cat([is_above, current.driven.mask], dim=1)
+        clearances = memory.surface.clearances
+        if self.supported_speed > 0:
+            probes, members = positions[:, : self.num_probes], memory.bodies[:, :, : self.num_probes]
+            # Mirror images that would lie in the surface count as well: they say how wide the foot is.
+            points = contact_points(probes, replace(memory, mirrored=memory.mask), members, self.mirror_hidden)
+            fastest = self.supported_speed * self.force_scale
+            sizes = body_sizes(memory)
+            clearances, rests = resting_clearances(points, statics, memory.motion, sizes, fastest, self.contact_reach)
+            memory = replace(memory, mirrored=memory.mask & (memory.mirrored | torch.gather(rests, 1, memory.own)))
+        return replace(memory, surface=static_surface(statics, above, is_above, self.edge_reach, clearances))
 
     def _may_be_hidden(
         self,
@@ -287,9 +333,9 @@ class InertialDynamics(AbstractDynamics):
         own = memory.own[:, probes]
         offsets = probe_positions - vectors_of(memory.motion.centers, own)
         moved = vectors_of(memory.motion.displacements, own) + memory.motion.turned(offsets, own) - offsets
-        statics = (static_positions, take(normals, memory.static_index), memory.static_mask, self.contact_reach)
+        statics = (static_positions, take(normals, memory.static_index), memory.static_mask)
         points = contact_points(probe_positions, memory, members, self.mirror_hidden)
-        contacts = nearest_static_contacts(points.positions, *statics)
+        contacts = static_contacts(memory.surface, points, statics, self.contact_reach)
         motion = self.forces(
             probe_positions,
             moved * memory.mask[:, probes, None],

@@ -8,6 +8,7 @@ from torch import Tensor
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
 from vpd_lightning.dynamics.inertial.hidden_side import HiddenParticles
 from vpd_lightning.dynamics.inertial.materials import Materials
+from vpd_lightning.dynamics.inertial.static_surface import StaticSurface
 
 
 @dataclass(frozen=True)
@@ -33,3 +34,4 @@ class InertialMemory:
     static_features: Float[Tensor, "batch static feature"]
     static_shade: Float[Tensor, "batch static feature"]  # with the moving ones where they were at first
     hidden: HiddenParticles | None
+    surface: StaticSurface

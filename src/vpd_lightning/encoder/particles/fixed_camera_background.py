@@ -1,5 +1,7 @@
 """What stands still in front of fixed cameras: the training-median depth of each camera."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
@@ -13,21 +15,24 @@ class BackgroundModel(AbstractBackground):
     """Marks pixels that lie nearer than the training-median depth of the same camera.
 
     Uses no labels, but fixed cameras. Depth, unlike colour, separates bodies from their shadows. The median images
-    live in the state dict.
+    live in the state dict; ``num_views``, ``height`` and ``width`` say their shape, null takes that of what is fitted
+    or loaded.
     """
 
     # Paper: not in the paper; it gives the inertial dynamics its candidates for motion.
 
     needs_fit = True
 
-    def __init__(self, *, num_views: int, height: int, width: int, depth_threshold: float):
+    def __init__(self, *, num_views: int | None, height: int | None, width: int | None, depth_threshold: float):
         super().__init__()
         if depth_threshold <= 0:
             raise ValueError(f"depth_threshold must be positive, got {depth_threshold}")
         self.depth_threshold = depth_threshold
-        self.register_buffer("depth", torch.zeros(num_views, height, width))
-        self.register_buffer("cam_to_world", torch.zeros(num_views, 4, 4))
+        self.shape = (num_views, height, width)
+        self.register_buffer("depth", torch.zeros(num_views or 0, height or 0, width or 0))
+        self.register_buffer("cam_to_world", torch.zeros(num_views or 0, 4, 4))
         self.register_buffer("is_fitted", torch.tensor(False))
+        self.register_load_state_dict_pre_hook(_shaped_as_loaded)
 
     def fit(
         self,
@@ -36,13 +41,13 @@ class BackgroundModel(AbstractBackground):
         cameras: Cameras,
     ) -> None:
         """Store the median depth (metres) and the poses of the cameras that took it; colours are not used."""
-        if depth.shape != self.depth.shape:
+        if any(size not in (None, found) for size, found in zip(self.shape, depth.shape, strict=True)):
             raise DataError(
-                f"background images are {tuple(depth.shape)}, the model expects {tuple(self.depth.shape)}.\n"
+                f"background images are {tuple(depth.shape)}, the model expects {self.shape}.\n"
                 "Set encoder.background.num_views, height and width to the data's."
             )
-        self.depth.copy_(torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0))
-        self.cam_to_world.copy_(cameras.cam_to_world)
+        self.depth = torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0).to(self.depth)
+        self.cam_to_world = cameras.cam_to_world.to(self.cam_to_world)
         self.is_fitted.fill_(True)
 
     def forward(self, frames: RGBDFrames) -> Bool[Tensor, "batch view height width"]:
@@ -67,3 +72,12 @@ class BackgroundModel(AbstractBackground):
                 "Use the training cameras as input views, or a model without encoder.background."
             )
         return index
+
+
+def _shaped_as_loaded(module: BackgroundModel, state: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+    """Take the shape of images that are loaded, where none was set."""
+    if None not in module.shape:
+        return
+    for name in ("depth", "cam_to_world"):
+        if prefix + name in state:
+            setattr(module, name, getattr(module, name).new_zeros(state[prefix + name].shape))
