@@ -116,6 +116,17 @@ class Pushing:
                 self._note(frame - 1)
             self._advance()
 
+    def simulate_frame(self) -> None:
+        """Simulate for the time of a frame without noting anything."""
+        for _ in range(self.settings.substeps):
+            self._advance()
+
+    def branched(self, data: Any) -> "Pushing":
+        """Return the same simulation on other data of the same model."""
+        other = object.__new__(Pushing)
+        other.__dict__.update(self.__dict__, data=data)
+        return other
+
     def _advance(self) -> None:
         import mujoco
 

@@ -13,8 +13,9 @@ from vpd_lightning.moved import install as _find_moved_modules
 if TYPE_CHECKING:
     from vpd_lightning.editing.scene_editor import SceneEditor
     from vpd_lightning.loading import load
+    from vpd_lightning.planning.plan import plan
     from vpd_lightning.simulator import Rollout, Scene, Simulator
-    from vpd_lightning.types import Cameras, Particles
+    from vpd_lightning.types import Cameras, Driven, Particles
 
 try:
     __version__ = version("vpd-lightning")
@@ -25,15 +26,28 @@ _find_moved_modules()
 
 _HOMES = {
     "Cameras": "vpd_lightning.types",
+    "Driven": "vpd_lightning.types",
     "Particles": "vpd_lightning.types",
     "Rollout": "vpd_lightning.simulator",
     "Scene": "vpd_lightning.simulator",
     "SceneEditor": "vpd_lightning.editing.scene_editor",
     "Simulator": "vpd_lightning.simulator",
     "load": "vpd_lightning.loading",
+    "plan": "vpd_lightning.planning.plan",
 }
 
-__all__ = ["Cameras", "Particles", "Rollout", "Scene", "SceneEditor", "Simulator", "__version__", "load"]
+__all__ = [
+    "Cameras",
+    "Driven",
+    "Particles",
+    "Rollout",
+    "Scene",
+    "SceneEditor",
+    "Simulator",
+    "__version__",
+    "load",
+    "plan",
+]
 
 
 def __getattr__(name: str) -> Any:

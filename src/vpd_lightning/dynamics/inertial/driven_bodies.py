@@ -17,6 +17,9 @@ from vpd_lightning.types import Driven
 _REACH = 1.5
 """Spacings beside a point within which it still locates its surface."""
 
+_NEAR_SPACINGS = 1.0
+"""Of the driven points, from a body: nearer, its own points may meet the surface between them."""
+
 _STEP_SHARE = 0.25
 """Of the size of a body: what a driven point moves farther in a step is looked at in parts, lest it jump over it."""
 
@@ -133,6 +136,11 @@ def meet(
     )
 
 
+def is_pushed(bodies: DrivenBodies, surface: Surface, motion: BodyMotion) -> Bool[Tensor, " batch"]:
+    """Return in which members a driven point comes near a body in this step; between them it may touch."""
+    return _met_by_driven(bodies, surface, motion, margin=_NEAR_SPACINGS)[1].any(dim=1)
+
+
 def joined_motion(motion: BodyMotion, driven: BodyMotion) -> BodyMotion:
     """Return the motion of bodies with that of driven parts behind."""
     names = [item.name for item in fields(BodyMotion)]
@@ -166,8 +174,13 @@ def joined_materials(materials: Materials, friction: Float[Tensor, ""], count: i
 
 
 @torch.no_grad()
-def _met_by_driven(bodies: DrivenBodies, surface: Surface, motion: BodyMotion) -> tuple[Tensor, Tensor]:
-    """Return the surface point whose tangent plane each driven point meets, and whether it meets one in this step."""
+def _met_by_driven(
+    bodies: DrivenBodies, surface: Surface, motion: BodyMotion, margin: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Return the surface point whose tangent plane each driven point meets, and whether it meets one in this step.
+
+    With a ``margin`` (spacings of the driven points) it is enough to come that near.
+    """
     moves = motion.carried(surface.positions, surface.own) - surface.positions
     # Each member has a number of parts of its own: a batch equals its members.
     fastest = bodies.displacements.norm(dim=-1).amax(dim=1) + (moves.norm(dim=-1) * surface.is_usable).amax(dim=1)
@@ -175,7 +188,8 @@ def _met_by_driven(bodies: DrivenBodies, surface: Surface, motion: BodyMotion) -
     num_parts = (fastest / smallest).ceil().clamp(1, _MOST_PARTS)[:, None, None]
     target = torch.zeros_like(bodies.groups)
     is_met = torch.zeros_like(bodies.mask)
-    reach = (_REACH * surface.spacing[:, None]).square()
+    above = margin * bodies.spacing[:, None]
+    reach = (_REACH * surface.spacing[:, None] + above).square()
     for part in range(int(num_parts.max())):
         # The nearest point before a part of the step is on the side from which the surface is entered; the one nearest
         # after it may be on another face.
@@ -188,7 +202,9 @@ def _met_by_driven(bodies: DrivenBodies, surface: Surface, motion: BodyMotion) -
         height = (offsets * vectors_of(surface.normals, index)).sum(dim=-1)
         beside = offsets.square().sum(dim=-1) - height.square()
         depth = torch.gather(surface.sizes, 1, torch.gather(surface.own, 1, index)) / 3
-        inside = exists & bodies.mask & (beside < reach) & (height < 0) & (height > -depth) & (part < num_parts[:, 0])
+        inside = (
+            exists & bodies.mask & (beside < reach) & (height < above) & (height > -depth) & (part < num_parts[:, 0])
+        )
         target = torch.where(inside & ~is_met, index, target)
         is_met = is_met | inside
     return target, is_met

@@ -26,6 +26,7 @@ from vpd_lightning.dynamics.inertial.contact_points import (
 from vpd_lightning.dynamics.inertial.driven_bodies import (
     DrivenBodies,
     driven_bodies,
+    is_pushed,
     joined_inertia,
     joined_materials,
     joined_motion,
@@ -36,6 +37,7 @@ from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity, Surfel
 from vpd_lightning.dynamics.inertial.hidden_side import HiddenGuess, hidden_after
 from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
+from vpd_lightning.dynamics.inertial.resting import is_slow, members_in_use, rows_of, with_rows
 from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, fit_twists, rotate, rotation_from_spin
 from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
 from vpd_lightning.dynamics.inertial.static_surface import (
@@ -46,6 +48,9 @@ from vpd_lightning.dynamics.inertial.static_surface import (
 from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles
+
+_IDLE_SHARE = 0.02
+"""In ``force_scale``, metres per step: a body in contact that moves less is at rest."""
 
 _BOUNCE_SHARE = 0.3
 """Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, so that bodies come to rest."""
@@ -75,6 +80,9 @@ class InertialDynamics(AbstractDynamics):
     goes on under bodies; null: it goes on without end. A body that approaches the surface under it by less than
     ``supported_speed`` (in ``force_scale``, per step) when it is first seen stands on it, whatever of its foot was seen
     (``static_surface``).
+
+    With ``skip_resting``, and without gradients, a member of the batch in which all bodies rest and nothing driven is
+    about to push one stays as it is.
 
     For comparisons, each part can be left out: with ``first_velocity`` null bodies start at rest; with ``keep_shape``
     false every particle goes on with its own velocity, to which it adds what its body's changes by; with
@@ -116,6 +124,7 @@ class InertialDynamics(AbstractDynamics):
         has_driven: bool = False,
         edge_reach: float | None = None,
         supported_speed: float = 0.0,
+        skip_resting: bool = False,
     ):
         super().__init__()
         for name, value in (("num_bodies", num_bodies), ("num_probes", num_probes)):
@@ -155,7 +164,7 @@ class InertialDynamics(AbstractDynamics):
                 "edge_reach must be positive or null and supported_speed not negative, "
                 f"got {edge_reach} and {supported_speed}"
             )
-        self.edge_reach, self.supported_speed = edge_reach, supported_speed
+        self.edge_reach, self.supported_speed, self.skip_resting = edge_reach, supported_speed, skip_resting
         self.has_driven = has_driven
         self.log_driven_friction = nn.Parameter(torch.tensor(math.log(0.3))) if has_driven else None
         self.static_shading = None
@@ -222,6 +231,7 @@ class InertialDynamics(AbstractDynamics):
             ),
             hidden=hidden,
             surface=static_surface((seen.positions, seen.normals, mask), seen.positions, mask, None, empty),
+            at_rest=~members_in_use(bodies),
         )
         statics = (static_positions, take(current.normals, static_index), static_mask)  # type: ignore[arg-type]
         return self._on_surface(current, memory, seen.positions, statics)
@@ -242,7 +252,11 @@ class InertialDynamics(AbstractDynamics):
             fastest = self.supported_speed * self.force_scale
             sizes = body_sizes(memory)
             clearances, rests = resting_clearances(points, statics, memory.motion, sizes, fastest, self.contact_reach)
-            memory = replace(memory, mirrored=memory.mask & (memory.mirrored | torch.gather(rests, 1, memory.own)))
+            memory = replace(
+                memory,
+                mirrored=memory.mask & (memory.mirrored | torch.gather(rests, 1, memory.own)),
+                at_rest=memory.at_rest | rests & self._is_slow(memory.motion),
+            )
         return replace(memory, surface=static_surface(statics, above, is_above, self.edge_reach, clearances))
 
     def _may_be_hidden(
@@ -281,7 +295,28 @@ class InertialDynamics(AbstractDynamics):
         with torch.autocast(device_type, enabled=False):  # geometry in full precision
             if not self.carry_memory and rollout_step > 0:
                 memory = self._first_memory(*observed(previous, current))
+            if not self.skip_resting or torch.is_grad_enabled():
+                return self._step(current, memory)
+            return self._step_where_it_moves(current, memory)
+
+    def _step_where_it_moves(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
+        """Advance the members of the batch in which something moves or is about to be pushed."""
+        count, is_idle = len(current.mask), memory.at_rest.all(dim=1)
+        driven = current.driven if self.has_driven else None
+        if driven is not None and bool(is_idle.any()):
+            positions = take(current.positions, memory.index) - memory.origin
+            surface = pushed_surface(positions, memory, self.mirror_hidden)
+            is_idle = is_idle & ~is_pushed(driven_bodies(driven, memory.origin), surface, memory.motion)
+        if not bool(is_idle.any()):
             return self._step(current, memory)
+        rows = (~is_idle).nonzero()[:, 0]
+        if len(rows) == 0:
+            return current, memory
+        moved = self._step(rows_of(current, rows, count), rows_of(memory, rows, count))
+        return with_rows(current, rows, moved[0], count), with_rows(memory, rows, moved[1], count)
+
+    def _is_slow(self, motion: BodyMotion) -> Bool[Tensor, "batch body"]:
+        return is_slow(motion, _IDLE_SHARE * self.force_scale, 0.2 * self.contact_range)
 
     def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
         positions = take(current.positions, memory.index) - memory.origin
@@ -309,7 +344,8 @@ class InertialDynamics(AbstractDynamics):
         if hidden is not None:
             places = (following, onward.centers, rotations)
             hidden, side = hidden_after(hidden, *places, self.moving_shading, memory.origin)
-        memory = replace(memory, motion=onward, normals=turned, velocities=velocities, hidden=hidden)
+        at_rest = resolved.touching.squeeze(-1) & self._is_slow(onward) | ~members_in_use(memory.bodies)
+        memory = replace(memory, motion=onward, normals=turned, velocities=velocities, hidden=hidden, at_rest=at_rest)
         # Normals rotate with their bodies: a memory rebuilt from these particles needs those of the new pose.
         normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
         return replace(current, positions=all_positions, features=features, normals=normals, hidden_side=side), memory

@@ -35,3 +35,4 @@ class InertialMemory:
     static_shade: Float[Tensor, "batch static feature"]  # with the moving ones where they were at first
     hidden: HiddenParticles | None
     surface: StaticSurface
+    at_rest: Bool[Tensor, "batch body"]  # it stands or lies and hardly moves; a place without a body does, too

@@ -1,0 +1,214 @@
+"""Observe, plan, act, observe: a planner in front of a world, simulated or real."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vpd_lightning.editing.clusters import object_clusters
+from vpd_lightning.planning.plan import Plan, plan
+from vpd_lightning.planning.solvers import Solution, Solver
+from vpd_lightning.planning.tasks import Task
+from vpd_lightning.planning.tool import PlanarTool
+from vpd_lightning.simulator import Scene, Simulator
+from vpd_lightning.types import Cameras, Driven, Particles
+
+_LOST = 0.08
+"""Metres from where a body was expected within which particles stand for it where no cluster is found."""
+
+
+class Moment(Protocol):
+    """What cameras see at a moment, and where the pusher's middle is (3,)."""
+
+    @property
+    def rgb(self) -> NDArray[np.uint8]: ...  # (view, height, width, 3)
+    @property
+    def depth(self) -> NDArray[np.float32]: ...  # (view, height, width), m
+    @property
+    def pusher(self) -> NDArray[np.float64]: ...
+
+
+class World(Protocol):
+    """What is acted on: a simulation, or a robot and its cameras."""
+
+    def observe(self) -> Moment: ...
+    def cameras(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]: ...
+    def pusher_surface(self, pusher: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]: ...
+    def advance(self, goals: NDArray[np.float64]) -> None: ...
+
+
+class TrueWorld(World, Protocol):
+    """A simulation that knows its bodies and can be tried out."""
+
+    @property
+    def places(self) -> NDArray[np.float64]: ...
+    @property
+    def pusher(self) -> NDArray[np.float64]: ...
+    @property
+    def command(self) -> NDArray[np.float64]: ...
+    def copy(self) -> "TrueWorld": ...
+
+
+@dataclass
+class Episode:
+    """What happened: whether the task was solved, seconds for each decision, and what was seen and planned."""
+
+    solved: bool = False
+    seconds: list[float] = field(default_factory=list)
+    costs: list[float] = field(default_factory=list)
+    moments: list[Moment] = field(default_factory=list)
+    plans: list[Plan | None] = field(default_factory=list)
+    places: list[NDArray[np.float64]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """How often is planned, and for how long: ``num_knots`` actions ahead, of which ``num_executed`` are taken."""
+
+    tool: PlanarTool
+    solver: Solver
+    num_knots: int
+    num_executed: int
+    num_decisions: int
+
+    def frames(self, actions: Tensor, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the places to command, one for each frame, of the actions that are taken."""
+        first = torch.from_numpy(start).to(actions)
+        return self.tool.path(first, actions[None, : self.num_executed])[0].double().numpy()
+
+
+def run_with_model(
+    simulator: Simulator, world: TrueWorld, task: Task, loop: Loop, input_views: Sequence[int], seed: int = 0
+) -> Episode:
+    """Solve a task by planning with a trained simulator from what the cameras see.
+
+    The task names its bodies by where they are at first (a person would click on them); from then on each is the
+    cluster of particles nearest to where it was predicted to be.
+    """
+    episode, start = Episode(), None
+    expected = torch.from_numpy(world.places)
+    before = world.observe()
+    world.advance(world.command[None])
+    for decision in range(loop.num_decisions):
+        now = world.observe()
+        began = time.perf_counter()
+        scene = _encoded(simulator, world, before, now, input_views)
+        bodies = _bodies(scene.current, expected)
+        found = plan(
+            simulator,
+            scene,
+            task.cost(bodies),
+            tool=loop.tool,
+            solver=loop.solver,
+            num_knots=loop.num_knots,
+            start=start,
+            seed=seed + decision,
+        )
+        episode.seconds.append(time.perf_counter() - began)
+        start = found.later(loop.num_executed)
+        after = found.states[loop.num_executed * loop.tool.hold - 1]
+        expected = torch.stack([after.positions[0, chosen].double().mean(dim=0).cpu() for chosen in bodies])
+        _note(episode, world, now, found, found.cost)
+        goals = loop.frames(found.actions, world.command)
+        world.advance(goals[:-1])
+        before = world.observe()
+        world.advance(goals[-1:])
+    return _judged(episode, world, task)
+
+
+def run_with_truth(world: TrueWorld, task: Task, loop: Loop, seed: int = 0) -> Episode:
+    """Solve a task by planning with the world itself: the ceiling of what the same planner can reach."""
+    episode, start = Episode(), torch.zeros(loop.num_knots, 2)
+    chosen = [torch.arange(len(world.places)) == number for number in range(len(world.places))]
+    world.advance(world.command[None])
+    for decision in range(loop.num_decisions):
+        began = time.perf_counter()
+        cost = task.cost(chosen)
+
+        def evaluate(candidates: Tensor) -> Tensor:
+            return cost(_tried(world, loop.tool.path(torch.from_numpy(world.command).float(), candidates)))  # noqa: B023
+
+        found: Solution = loop.solver.solve(evaluate, start, seed + decision)
+        episode.seconds.append(time.perf_counter() - began)
+        start = torch.cat([found.actions[loop.num_executed :], torch.zeros(loop.num_executed, 2)])
+        _note(episode, world, None, None, found.cost)
+        world.advance(loop.frames(found.actions, world.command))
+    return _judged(episode, world, task)
+
+
+def run_without_action(world: TrueWorld, task: Task, loop: Loop) -> Episode:
+    """Do nothing for as long."""
+    episode = Episode()
+    world.advance(np.repeat(world.command[None], 1 + loop.num_decisions * loop.num_executed * loop.tool.hold, axis=0))
+    return _judged(episode, world, task)
+
+
+def _note(episode: Episode, world: TrueWorld, moment: Moment | None, found: Plan | None, cost: float) -> None:
+    episode.costs.append(cost)
+    episode.places.append(world.places)
+    episode.plans.append(found)
+    if moment is not None:
+        episode.moments.append(moment)
+
+
+def _judged(episode: Episode, world: TrueWorld, task: Task) -> Episode:
+    episode.places.append(world.places)
+    episode.solved = task.is_solved(world.places)
+    return episode
+
+
+def _encoded(simulator: Simulator, world: World, before: Moment, now: Moment, views: Sequence[int]) -> Scene:
+    chosen = list(views)
+    height, width = now.depth.shape[-2:]
+    cameras = Cameras.from_arrays(*world.cameras(), height, width)[chosen]
+    surfaces = [world.pusher_surface(moment.pusher) for moment in (before, now)]
+    driven = Driven.from_arrays(*(np.stack(parts) for parts in zip(*surfaces, strict=True)))
+    rgb, depth = (np.stack([getattr(moment, name)[chosen] for moment in (before, now)]) for name in ("rgb", "depth"))
+    return simulator.encode(rgb, depth, cameras, driven=driven)
+
+
+def _bodies(particles: Particles, expected: Tensor) -> list[Bool[Tensor, " particle"]]:
+    """Return the particles of each body, known by where it is expected: those of the nearest cluster, near as it is."""
+    labels = object_clusters(particles)
+    positions, mask = particles.positions[0].double().cpu(), particles.mask[0].cpu()
+    numbers = [int(number) for number in labels.unique() if number >= 0]
+    middles = torch.stack([positions[labels.cpu() == number].mean(dim=0) for number in numbers]) if numbers else None
+    found = []
+    for place in expected:
+        gaps = None if middles is None else (middles - place).norm(dim=-1)
+        if gaps is not None and float(gaps.min()) < _LOST:
+            found.append(labels.cpu() == numbers[int(gaps.argmin())])
+            continue
+        distances = (positions - place).norm(dim=-1).masked_fill(~mask, torch.inf)
+        found.append(distances <= max(float(distances.min()), 1e-9))
+    return found
+
+
+def _tried(world: TrueWorld, paths: Tensor) -> list[Particles]:
+    """Return what the world does with each path, as particles: one for each body."""
+    steps: list[list[NDArray[np.float64]]] = []
+    pushers: list[list[NDArray[np.float64]]] = []
+    for path in paths.double().numpy():
+        trial = world.copy()
+        steps.append([])
+        pushers.append([])
+        for goal in path:
+            trial.advance(goal[None])
+            steps[-1].append(trial.places)
+            pushers[-1].append(trial.pusher)
+    places, tools = (torch.from_numpy(np.array(part)).float() for part in (steps, pushers))
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(places), 1, 3)
+    return [
+        Particles(
+            positions=places[:, step],
+            features=torch.zeros_like(places[:, step, :, :1]),
+            driven=Driven(tools[:, step, None], up, torch.zeros(len(places), 1, dtype=torch.int64)),
+        )
+        for step in range(places.shape[1])
+    ]
