@@ -14,6 +14,7 @@ from data_gen.pushing.motion import CommandedPath
 from data_gen.pushing.scene import Pushing, cylinder_surface
 from data_gen.pushing.settings import PushingSettings
 from data_gen.renderers import Renderer, open_renderer
+from vpd_lightning.errors import RenderingBackendError, one_line
 
 _MAX_TRIALS = 1000
 
@@ -31,7 +32,10 @@ class PushingWorld:
     """Bodies on the table and a pusher whose middle is commanded; time goes on frame by frame.
 
     A ``seed`` draws bodies and the pusher's place as those of the data set are drawn, but for pushers, which begin
-    anywhere beside the bodies. ``backend`` null: without pictures. The last two moments are kept: a model sees two.
+    anywhere beside the bodies. ``backend`` null: without pictures.
+
+    Raises:
+        RenderingBackendError: MuJoCo cannot draw by the backend in this process.
     """
 
     def __init__(self, settings: PushingSettings, seed: int, backend: str | None) -> None:
@@ -43,12 +47,18 @@ class PushingWorld:
         self._pushing = Pushing(self.settings, self.bodies, _standing(start))
         self.command = start
         self._renderer: Renderer | None = None
-        if backend is not None:
-            labels = labels_of(self._pushing.model, len(self.bodies))
-            self._renderer = open_renderer(backend, self._pushing.model, settings, labels)
-        self.frame = 0
         import mujoco
 
+        if backend is not None:
+            labels = labels_of(self._pushing.model, len(self.bodies))
+            try:
+                self._renderer = open_renderer(backend, self._pushing.model, settings, labels)
+            except mujoco.FatalError as error:
+                raise RenderingBackendError(
+                    f"MuJoCo was imported before it was known that {backend} draws ({one_line(error)}).\n"
+                    f"Set MUJOCO_GL={backend} in the environment of the program."
+                ) from error
+        self.frame = 0
         mujoco.mj_forward(self._pushing.model, self._pushing.data)
 
     def _free_place(self, generator: np.random.Generator) -> NDArray[np.float64]:

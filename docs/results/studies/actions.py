@@ -4,7 +4,8 @@
 checkpoint on bodies whose true centre moves by more than ``MOVED`` within 16 steps. A model that takes actions is
 given the true motion (``true``), that of another clip, carried to where the pusher is (``shuffled``), and none
 (``still``: the pusher stays). Errors are those of ``vpd-eval``: of the centre in centimetres, of the orientation in
-degrees, by horizon; beside them what needs no model. Intervals: 2,000 resamples of trajectories.
+degrees, by horizon; beside them what needs no model (a constant displacement means nothing where bodies are pushed
+any way). Intervals: 2,000 resamples of trajectories.
 """
 
 import argparse
@@ -21,7 +22,6 @@ from numpy.typing import NDArray
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
 from vpd_lightning.evaluation.prediction import encode_clip, roll_out_clip, takes_actions
-from vpd_lightning.evaluation.references import median_displacements
 from vpd_lightning.files import AtomicPath
 from vpd_lightning.loading import LoadedModel, load_model
 from vpd_lightning.types import Driven
@@ -29,7 +29,7 @@ from vpd_lightning.types import Driven
 STEPS = (1, 2, 4, 8, 16, 32)
 MOVED = 0.01  # metres
 TOUCHED_WITHIN = 16  # steps
-REFERENCES = {"nothing moves": "copy", "true velocity": "velocity", "best constant": "constant"}
+REFERENCES = {"nothing moves": "copy", "true velocity": "velocity"}
 _NUM_RESAMPLES = 2000
 
 
@@ -58,7 +58,6 @@ def _with_positions(clip: Clip, context: Driven, positions: torch.Tensor) -> Cli
 def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) -> dict[str, Any]:
     """Return the errors of one model with each kind of action."""
     margin = model.config["protocol"]["body_margin"]
-    constants = median_displacements(sorted((data / "train").glob("*.h5")), starts, max(STEPS))
     files = sorted((data / split).glob("*.h5"))
     rows: dict[str, list[NDArray[np.float64]]] = {}
     trajectory: list[int] = []
@@ -74,7 +73,7 @@ def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) 
                 scene = encode_clip(model.simulator, clip, model.input_views)
                 for name, shown in variants(model, clip, other).items():
                     states = roll_out_clip(model.simulator, scene, shown, max(STEPS))
-                    motion, _ = clip_motion(clip, trajectory_of(scene.current, states), margin, constants.get(start))
+                    motion, _ = clip_motion(clip, trajectory_of(scene.current, states), margin, None)
                     keep = touched[: len(motion["centroid_error"])]
                     for metric, values in motion.items():
                         rows.setdefault(f"{name}/{metric}", []).append(values[keep].numpy())

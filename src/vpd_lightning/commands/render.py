@@ -29,7 +29,7 @@ def _render(config: Mapping[str, Any]) -> None:
     from vpd_lightning.editing.colored_editor import colored_editor
     from vpd_lightning.editing.edit_files import load_edit, replay
     from vpd_lightning.errors import OutOfMemoryError
-    from vpd_lightning.evaluation.prediction import encode_clip
+    from vpd_lightning.evaluation.prediction import encode_clip, recorded_motion
     from vpd_lightning.files import OutputFolder, choose_folder
     from vpd_lightning.media import render_rollout
     from vpd_lightning.media.nerfstudio_paths import write_camera_path
@@ -62,7 +62,8 @@ def _render(config: Mapping[str, Any]) -> None:
                 if operations:
                     viewpoint = clip.cameras.cam_to_world[1, :, :3, 3].mean(0)
                     scene = replay(colored_editor(model.simulator, scene, viewpoint), operations).scene
-                states = render_rollout.predict(model.simulator, scene, config["num_steps"], freeze_step)
+                motion = recorded_motion(model.simulator, path, start, max(config["num_steps"], freeze_step or 0))
+                states = render_rollout.predict(model.simulator, scene, config["num_steps"], freeze_step, motion)
                 rendered = render_rollout.render_rollout(model.simulator, list(states.values()), viewpoints, progress)
         except torch.OutOfMemoryError as error:
             raise OutOfMemoryError(

@@ -26,6 +26,7 @@ from vpd_lightning.config.schema import (
     BenchConfig,
     EvalConfig,
     ExportConfig,
+    PlanConfig,
     RenderConfig,
     TrainConfig,
     ViewConfig,
@@ -43,6 +44,7 @@ SCHEMAS: dict[str, type] = {
     "view": ViewConfig,
     "bench": BenchConfig,
     "export": ExportConfig,
+    "plan": PlanConfig,
 }
 
 

@@ -203,6 +203,37 @@ class ViewConfig(RecordingConfig):
 
 
 @dataclass
+class SolverConfig:
+    """How a plan is looked for."""
+
+    name: str = MISSING
+    num_samples: int = MISSING
+    num_iterations: int = MISSING
+    num_elites: int = MISSING
+    spread: float = MISSING
+    temperature: float = MISSING
+
+
+@dataclass
+class PlanConfig(TrainedModelConfig):
+    """Root of ``vpd-plan``."""
+
+    task: str = MISSING
+    seed: int = MISSING
+    preset: str = MISSING
+    system: str = MISSING
+    solver: SolverConfig = MISSING
+    num_knots: int = MISSING
+    hold: int = MISSING
+    num_executed: int = MISSING
+    num_decisions: int = MISSING
+    max_speed: float = MISSING
+    renderer: str = MISSING
+    fps: float = MISSING
+    out: str | None = None
+
+
+@dataclass
 class ExportConfig:
     """Root of ``vpd-export``."""
 

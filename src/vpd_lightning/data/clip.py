@@ -140,5 +140,17 @@ def read_clip(
         )
 
 
+def read_motion(path: Path, first: int, num_steps: int) -> Driven | None:
+    """Return the given motion of a recording from frame ``first`` on (axis ``step``); None where it has none.
+
+    What is driven stays where it is after the last recorded frame.
+    """
+    driven = read_driven(path)
+    if driven is None:
+        return None
+    last = len(driven.points) - 1
+    return driven_tensors(driven.at([min(first + step, last) for step in range(num_steps)]))
+
+
 def _float32(array: NDArray[np.float64]) -> Tensor:
     return torch.from_numpy(array.astype(np.float32))

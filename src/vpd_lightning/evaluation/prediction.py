@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol as StructuralType
 from typing import runtime_checkable
 
@@ -12,12 +13,12 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vpd_lightning.data.clip import Clip
+from vpd_lightning.data.clip import Clip, read_motion
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.evaluation.motion import trajectory_of
 from vpd_lightning.geometry.resizing import resize_images
 from vpd_lightning.simulator import Scene
-from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras, Particles
+from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras, Driven, Particles
 
 
 @runtime_checkable
@@ -121,6 +122,11 @@ def roll_out_clip(simulator: PredictsVideo, scene: Scene, clip: Clip, num_steps:
     if missing > 0:
         motion = motion.mapped(lambda values: torch.cat([values, values[-1:].expand(missing, *values.shape[1:])]))
     return simulator.rollout(scene, num_steps, driven=motion)  # type: ignore[call-arg]
+
+
+def recorded_motion(simulator: PredictsVideo, path: Path, start: int, num_steps: int) -> Driven | None:
+    """Return what a rollout from the frames ``start`` and ``start + 1`` is given; None for systems without actions."""
+    return read_motion(path, start + NUM_CONTEXT_FRAMES, num_steps) if takes_actions(simulator) else None
 
 
 def takes_actions(system: PredictsVideo | PredictsViews) -> bool:

@@ -22,7 +22,7 @@ from vpd_lightning.media.pictures import write_contact_sheet, write_particle_plo
 from vpd_lightning.media.video import comparison_frames, enlarge, error_image, write_video
 from vpd_lightning.media.viewpoints import Viewpoints
 from vpd_lightning.simulator import Scene, Simulator
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Driven, Particles
 
 PARTICLE_FORMATS = tuple(WRITERS)
 _MAX_PANELS = 4
@@ -45,13 +45,16 @@ class RenderedRollout:
         return {name: getattr(self, name)[:, camera].numpy() for name in names}
 
 
-def predict(simulator: Simulator, scene: Scene, num_steps: int, freeze_step: int | None) -> dict[int, Particles]:
+def predict(
+    simulator: Simulator, scene: Scene, num_steps: int, freeze_step: int | None, motion: Driven | None = None
+) -> dict[int, Particles]:
     """Roll out, and return the states to render by their steps; step 0 is the last input frame.
 
-    With ``freeze_step`` that is one state, so many steps after the last input frame.
+    With ``freeze_step`` that is one state, so many steps after the last input frame. ``motion`` is that of what is
+    driven, at least as long.
     """
     last = num_steps if freeze_step is None else freeze_step
-    states = dict(enumerate([scene.current, *simulator.rollout(scene, last)]))
+    states = dict(enumerate([scene.current, *simulator.rollout(scene, last, driven=motion)]))
     return states if freeze_step is None else {freeze_step: states[freeze_step]}
 
 

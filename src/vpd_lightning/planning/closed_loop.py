@@ -1,9 +1,9 @@
 """Observe, plan, act, observe: a planner in front of a world, simulated or real."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,10 +19,13 @@ from vpd_lightning.planning.tool import PlanarTool
 from vpd_lightning.simulator import Scene, Simulator
 from vpd_lightning.types import Cameras, Driven, Particles
 
+Progress = Callable[[int, int, float], None]
+
 _LOST = 0.08
 """Metres from where a body was expected within which particles stand for it where no cluster is found."""
 
 
+@runtime_checkable
 class Moment(Protocol):
     """What cameras see at a moment, and where the pusher's middle is (3,)."""
 
@@ -34,6 +37,7 @@ class Moment(Protocol):
     def pusher(self) -> NDArray[np.float64]: ...
 
 
+@runtime_checkable
 class World(Protocol):
     """What is acted on: a simulation, or a robot and its cameras."""
 
@@ -43,6 +47,7 @@ class World(Protocol):
     def advance(self, goals: NDArray[np.float64]) -> None: ...
 
 
+@runtime_checkable
 class TrueWorld(World, Protocol):
     """A simulation that knows its bodies and can be tried out."""
 
@@ -65,6 +70,7 @@ class Episode:
     moments: list[Moment] = field(default_factory=list)
     plans: list[Plan | None] = field(default_factory=list)
     places: list[NDArray[np.float64]] = field(default_factory=list)
+    num_steps: int = 0  # frames from one decision to the next
 
 
 @dataclass(frozen=True)
@@ -84,14 +90,21 @@ class Loop:
 
 
 def run_with_model(
-    simulator: Simulator, world: TrueWorld, task: Task, loop: Loop, input_views: Sequence[int], seed: int = 0
+    simulator: Simulator,
+    world: TrueWorld,
+    task: Task,
+    loop: Loop,
+    input_views: Sequence[int],
+    seed: int = 0,
+    progress: Progress | None = None,
 ) -> Episode:
     """Solve a task by planning with a trained simulator from what the cameras see.
 
     The task names its bodies by where they are at first (a person would click on them); from then on each is the
-    cluster of particles nearest to where it was predicted to be.
+    cluster of particles nearest to where it was predicted to be. ``progress`` is called with the number of each
+    decision, how many there are and the cost of its plan.
     """
-    episode, start = Episode(), None
+    episode, start = Episode(num_steps=loop.num_executed * loop.tool.hold), None
     expected = torch.from_numpy(world.places)
     before = world.observe()
     world.advance(world.command[None])
@@ -112,13 +125,17 @@ def run_with_model(
         )
         episode.seconds.append(time.perf_counter() - began)
         start = found.later(loop.num_executed)
-        after = found.states[loop.num_executed * loop.tool.hold - 1]
+        after = found.states[episode.num_steps - 1]
         expected = torch.stack([after.positions[0, chosen].double().mean(dim=0).cpu() for chosen in bodies])
         _note(episode, world, now, found, found.cost)
+        if progress is not None:
+            progress(decision, loop.num_decisions, found.cost)
         goals = loop.frames(found.actions, world.command)
         world.advance(goals[:-1])
         before = world.observe()
         world.advance(goals[-1:])
+    episode.moments.append(world.observe())
+    episode.plans.append(None)
     return _judged(episode, world, task)
 
 

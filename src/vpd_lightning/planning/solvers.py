@@ -6,7 +6,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -26,12 +26,14 @@ class Solution:
     history: list[float]
 
 
+@runtime_checkable
 class Solver(Protocol):
     """What ``plan`` asks of a solver."""
 
-    num_samples: int
-    num_iterations: int
-
+    @property
+    def num_samples(self) -> int: ...
+    @property
+    def num_iterations(self) -> int: ...
     def solve(self, evaluate: Evaluate, start: Float[Tensor, "knot axis"], seed: int) -> Solution:
         """Return the best of all evaluated candidates; the same seed draws the same candidates."""
 

@@ -45,6 +45,15 @@ class Task:
             return not bool((inside & (places[:, 2] > FALLEN)).any())
         return bool(np.hypot(*(places[0, :2] - self.goal)) < PLACE_TOLERANCE and places[0, 2] > FALLEN)
 
+    def distance(self, places: NDArray[np.float64]) -> float:
+        """Return how far true centres (body, 3) are from solving the task (metres)."""
+        if self.kind == "place":
+            return float(np.hypot(*(places[0, :2] - self.goal)))
+        if self.kind == "off_table":
+            return max(0.0, float((self.half_size - np.abs(places[0, :2])).min())) if places[0, 2] > FALLEN else 0.0
+        inside = ROOM_RADIUS - np.hypot(*(places[:, :2] - self.goal).T)
+        return float(np.where(places[:, 2] > FALLEN, inside.clip(min=0), 0.0).sum())
+
     def cost(self, bodies: list[Bool[Tensor, " particle"]]) -> Cost:
         """Return what a plan should lower; ``bodies`` are the particles of each body, first of the one to be moved."""
         goal = torch.from_numpy(self.goal)

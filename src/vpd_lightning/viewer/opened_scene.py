@@ -15,7 +15,7 @@ from vpd_lightning.data.clip import read_clip
 from vpd_lightning.data.manifest import Manifest
 from vpd_lightning.data.reader import TrajectoryReader
 from vpd_lightning.editing.colored_editor import colored_editor
-from vpd_lightning.evaluation.prediction import encode_clip
+from vpd_lightning.evaluation.prediction import encode_clip, recorded_motion
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.media.camera_paths import common_target
 from vpd_lightning.media.particle_colors import particle_colors
@@ -123,7 +123,8 @@ def open_scene(
     cameras = Cameras(torch.from_numpy(intrinsics[0]).float(), torch.from_numpy(poses[0]).float(), height, width)
     scene = encode_clip(simulator, clip, list(input_views))
     viewpoint = cameras.cam_to_world[list(input_views), :3, 3].mean(dim=0)
+    motion = recorded_motion(simulator, path, start, len(truth) - 1)
     return OpenedScene(
         simulator, scene, cameras, truth, tuple(input_views), low, high, path, start, title, kind,
-        Rollout(simulator, colored_editor(simulator, scene, viewpoint)), manifest,
+        Rollout(simulator, colored_editor(simulator, scene, viewpoint), motion), manifest,
     )  # fmt: skip

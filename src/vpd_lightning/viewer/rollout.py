@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from vpd_lightning.editing.scene_editor import SceneEditor
 from vpd_lightning.simulator import Rollout as SimulatedRollout
 from vpd_lightning.simulator import Simulator
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Driven, Particles
 
 _numbers = itertools.count()
 
@@ -17,11 +17,12 @@ _numbers = itertools.count()
 class Rollout:
     """``states[0]`` is the last input frame, as edited; later ones are there as far as ``reach`` was called.
 
-    ``number`` is unlike that of every other rollout. Methods may be called from any thread.
+    ``number`` is unlike that of every other rollout. ``motion`` is that of what is driven (axis ``step``), which stays
+    where it is afterwards. Methods may be called from any thread.
     """
 
-    def __init__(self, simulator: Simulator, editor: SceneEditor):
-        self.simulator, self.editor = simulator, editor
+    def __init__(self, simulator: Simulator, editor: SceneEditor, motion: Driven | None = None):
+        self.simulator, self.editor, self.motion = simulator, editor, motion
         self.states: list[Particles] = [editor.scene.current]
         self.colors: dict[int, UInt8[NDArray, "particle 3"]] = {}
         self.figures: dict[tuple[int, int], dict[str, float]] = {}  # by step and recorded camera
@@ -41,10 +42,15 @@ class Rollout:
         """Whether anything was edited."""
         return bool(self.editor.operations)
 
+    def _driven_to(self, step: int) -> Driven | None:
+        if self.motion is None or step >= len(self.motion.mask):
+            return None
+        return self.motion[step : step + 1]
+
     def reach(self, step: int) -> None:
         """Simulate as far as ``step``; what was simulated before is not simulated again."""
         with self._lock:
             while self.num_steps < step:
                 last = self._last or self.simulator.start(self.editor.scene)
-                self._last = last.step()
+                self._last = last.step(self._driven_to(self.num_steps))
                 self.states.append(self._last.particles)

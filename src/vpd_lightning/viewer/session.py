@@ -40,7 +40,8 @@ class Session:
         self._labels: list[tuple[Operation, str]] = []
 
     def _fresh(self, editor: SceneEditor) -> Rollout:
-        return Rollout(self.opened.simulator, editor) if editor.operations else self.opened.rollout
+        opened = self.opened
+        return Rollout(opened.simulator, editor, opened.rollout.motion) if editor.operations else opened.rollout
 
     @property
     def other(self) -> Rollout | None:

@@ -22,6 +22,8 @@ class BackgroundModel(AbstractBackground):
     # Paper: not in the paper; it gives the inertial dynamics its candidates for motion.
 
     needs_fit = True
+    depth: Tensor
+    cam_to_world: Tensor
 
     def __init__(self, *, num_views: int | None, height: int | None, width: int | None, depth_threshold: float):
         super().__init__()
