@@ -63,8 +63,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
     or ``r_a_s``): the same functions, from inputs of order one whatever the scene's unit of length. ``edge_gain``
     multiplies those between particles and abstract nodes: velocity shows as a shift by a fraction of ``r_s``.
 
-    ``aggregation`` reduces the edges at a node: their ``sum``, or their ``mean``, whose size does not
-    depend on how many particles lie around a node.
+    ``aggregation`` reduces the edges at a node: ``sum``, or ``mean``, which does not grow with their number.
 
     Without ``update_features`` there is no feature decoder, and particles keep the features that they were encoded
     with: only their positions change. With it, a network that has not learned the motion yet lowers the image error by
@@ -76,9 +75,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
 
     With ``has_driven`` the driven points of the current particles are senders of a fourth kind, connected to abstract
     nodes as particles are: their initial feature is the displacement that they are given in this step (in location
-    scales) and their normal. They are not updated.
-
-    # Paper: has no actions, so has_driven is false and there is nothing of it.
+    scales) and their normal. They are not updated. (The paper has no actions.)
 
     ``last_uncovered_share`` is the share of current particles without abstract node in reach in the last call.
     """

@@ -13,35 +13,36 @@ from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.inertial.body_forces import BodyForces
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, body_volumes, matrices_of, vectors_of
 from vpd_lightning.dynamics.inertial.contact import (
-    ContactSolver,
     Resolved,
-    nearest_static_contacts,
 )
 from vpd_lightning.dynamics.inertial.contact_points import (
-    between_bodies,
-    body_sizes,
     contact_points,
     pushed_surface,
 )
+from vpd_lightning.dynamics.inertial.contact_step import resolved_contacts
 from vpd_lightning.dynamics.inertial.driven_bodies import (
     DrivenBodies,
     driven_bodies,
     is_pushed,
-    joined_inertia,
-    joined_materials,
-    joined_motion,
-    meet,
 )
-from vpd_lightning.dynamics.inertial.first_motion import find_first_motion, gather_index, movable, observed, put, take
-from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity, Surfels
+from vpd_lightning.dynamics.inertial.first_motion import (
+    arriving_motion,
+    find_first_motion,
+    gather_index,
+    movable,
+    observed,
+    put,
+    take,
+)
+from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity
 from vpd_lightning.dynamics.inertial.hidden_side import HiddenGuess, hidden_after
 from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
-from vpd_lightning.dynamics.inertial.resting import is_slow, members_in_use, rows_of, with_rows
-from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, fit_twists, rotate, rotation_from_spin
+from vpd_lightning.dynamics.inertial.resting import is_slow, members_in_use, rested, rows_of, with_rows
+from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, rotate, rotation_from_spin
 from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
+from vpd_lightning.dynamics.inertial.standing import may_be_hidden, standing
 from vpd_lightning.dynamics.inertial.static_surface import (
-    resting_clearances,
     static_contacts,
     static_surface,
 )
@@ -49,8 +50,8 @@ from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles
 
-_IDLE_SHARE = 0.02
-"""In ``force_scale``, metres per step: a body in contact that moves less is at rest."""
+_ARM = 0.2
+"""Of the contact range, about a body's size: a rotation counts by how far it moves a point there."""
 
 _BOUNCE_SHARE = 0.3
 """Impacts slower than this share of ``force_scale`` (metres per step) do not bounce, so that bodies come to rest."""
@@ -81,8 +82,8 @@ class InertialDynamics(AbstractDynamics):
     ``supported_speed`` (in ``force_scale``, per step) when it is first seen stands on it, whatever of its foot was seen
     (``static_surface``).
 
-    With ``skip_resting``, and without gradients, a member of the batch in which all bodies rest and nothing driven is
-    about to push one stays as it is.
+    With ``skip_resting``, and without gradients, a member of the batch in which all bodies rest (in contact, slower
+    than ``rest_share``) and nothing driven is about to push one stays as it is.
 
     For comparisons, each part can be left out: with ``first_velocity`` null bodies start at rest; with ``keep_shape``
     false every particle goes on with its own velocity, to which it adds what its body's changes by; with
@@ -198,7 +199,10 @@ class InertialDynamics(AbstractDynamics):
             centers = equidistant_centers(seen.positions, seen.normals, shares, self.extent_weight)
             static_index, static_mask = gather_index(current.mask & ~movable(current))
             static_positions = take(current.positions, static_index)
-            mirrored = mask & self._may_be_hidden(current, seen, bodies, centers, static_index, static_mask)
+            mirrored = mask & may_be_hidden(
+                (static_positions, take(current.normals, static_index), static_mask),  # type: ignore[arg-type]
+                seen.positions, bodies, centers, self.contact_reach,
+            )  # fmt: skip
             spacing = point_spacing(seen.positions, mask)
         materials = self.materials(seen.features, shares)
         hidden = None
@@ -212,7 +216,7 @@ class InertialDynamics(AbstractDynamics):
             mask=mask,
             bodies=bodies,
             own=found.own,
-            motion=_first_motion(seen.positions, found.matched.displacements, shares, centers),
+            motion=arriving_motion(seen.positions, found.matched.displacements, shares, centers),
             materials=materials,
             masses=materials.density * body_volumes(seen.positions, centers, shares),
             spacing=spacing,
@@ -234,44 +238,19 @@ class InertialDynamics(AbstractDynamics):
             at_rest=~members_in_use(bodies),
         )
         statics = (static_positions, take(current.normals, static_index), static_mask)  # type: ignore[arg-type]
-        return self._on_surface(current, memory, seen.positions, statics)
-
-    def _on_surface(
-        self, current: Particles, memory: InertialMemory, positions: Tensor, statics: tuple[Tensor, Tensor, Tensor]
-    ) -> InertialMemory:
-        """Find what of the static surface is hidden, where it ends, and which bodies rest on it."""
-        above, is_above = positions.detach(), memory.mask
-        if self.has_driven and current.driven is not None:
-            above = torch.cat([above, current.driven.positions - memory.origin], dim=1)
-            is_above = torch.cat([is_above, current.driven.mask], dim=1)
-        clearances = memory.surface.clearances
-        if self.supported_speed > 0:
-            probes, members = positions[:, : self.num_probes], memory.bodies[:, :, : self.num_probes]
-            # Mirror images that would lie in the surface count as well: they say how wide the foot is.
-            points = contact_points(probes, replace(memory, mirrored=memory.mask), members, self.mirror_hidden)
-            fastest = self.supported_speed * self.force_scale
-            sizes = body_sizes(memory)
-            clearances, rests = resting_clearances(points, statics, memory.motion, sizes, fastest, self.contact_reach)
-            memory = replace(
-                memory,
-                mirrored=memory.mask & (memory.mirrored | torch.gather(rests, 1, memory.own)),
-                at_rest=memory.at_rest | rests & self._is_slow(memory.motion),
-            )
-        return replace(memory, surface=static_surface(statics, above, is_above, self.edge_reach, clearances))
-
-    def _may_be_hidden(
-        self,
-        current: Particles,
-        seen: Surfels,
-        bodies: Tensor,
-        centers: Tensor,
-        static_index: Tensor,
-        static_mask: Tensor,
-    ) -> Bool[Tensor, "batch moving"]:
-        """Return whose mirror image through the centre does not lie inside what stands still: nothing can be there."""
-        mirrored = 2 * (bodies[..., None] * centers[:, :, None]).sum(dim=1) - seen.positions
-        places, normals = take(current.positions, static_index), take(current.normals, static_index)  # type: ignore[arg-type]
-        return nearest_static_contacts(mirrored, places, normals, static_mask, self.contact_reach).distances > 0
+        return standing(
+            memory,
+            seen.positions,
+            statics,
+            current.driven if self.has_driven else None,
+            num_probes=self.num_probes,
+            is_mirrored=self.mirror_hidden,
+            supported_speed=self.supported_speed * self.force_scale,
+            rest_speed=self.rest_share * self.force_scale,
+            arm=_ARM * self.contact_range,
+            edge_reach=self.edge_reach,
+            far=self.contact_reach,
+        )
 
     def completed(self, previous: Particles, current: Particles, keys: RandomKeys) -> Particles:
         """Return the current particles with what is guessed of the hidden sides of bodies."""
@@ -316,7 +295,7 @@ class InertialDynamics(AbstractDynamics):
         return with_rows(current, rows, moved[0], count), with_rows(memory, rows, moved[1], count)
 
     def _is_slow(self, motion: BodyMotion) -> Bool[Tensor, "batch body"]:
-        return is_slow(motion, _IDLE_SHARE * self.force_scale, 0.2 * self.contact_range)
+        return is_slow(motion, self.rest_share * self.force_scale, _ARM * self.contact_range)
 
     def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
         positions = take(current.positions, memory.index) - memory.origin
@@ -325,7 +304,7 @@ class InertialDynamics(AbstractDynamics):
         if self.has_driven and current.driven is not None and current.driven.mask.any():
             driven = driven_bodies(current.driven, memory.origin)
         resolved = self._resolved(positions, static_positions, current.normals, memory, driven)  # type: ignore[arg-type]
-        step, onward = self._rested(resolved)
+        step, onward = rested(resolved, self.rest_share * self.force_scale, _ARM * self.contact_range)
         own = memory.own
         moved = step.carried(positions, own)
         velocities = memory.velocities
@@ -382,53 +361,20 @@ class InertialDynamics(AbstractDynamics):
             inertia,
         )
         motion = replace(motion, strains=_elastic(motion, materials))
-        between, masses, num_bodies = between_bodies(points, memory), memory.masses, memory.masses.shape[1]
-        met = None
-        if driven is not None:
-            surface = pushed_surface(positions, memory, self.mirror_hidden)
-            met = meet(driven, surface, motion, points, contacts, between)
-        if driven is not None and met is not None:
-            assert self.log_driven_friction is not None
-            points, contacts, between = met.points, met.static, met.between
-            count = driven.members.shape[1]
-            motion, inertia = joined_motion(motion, driven.motion), joined_inertia(inertia, count)
-            materials = joined_materials(materials, self.log_driven_friction.exp(), count)
-            masses = torch.cat([masses, torch.full_like(masses[:, :1], torch.inf).expand(-1, count, -1)], dim=1)
-        solver = ContactSolver(
-            points=points,
-            centers=motion.centers,
-            inertia=inertia,
-            materials=materials,
-            masses=masses,
-            rest_speed=_BOUNCE_SHARE * self.force_scale,
-            num_driven=masses.shape[1] - num_bodies,
-        )
-        resolved = solver.resolve(
+        return resolved_contacts(
             motion,
+            inertia,
+            memory,
+            positions,
+            points,
             contacts,
-            between,
+            driven,
+            None if self.log_driven_friction is None else self.log_driven_friction.exp(),
+            is_mirrored=self.mirror_hidden,
+            rest_speed=_BOUNCE_SHARE * self.force_scale,
             num_iterations=self.num_contact_iterations,
             max_depth=self.max_contact_depth,
         )
-        return resolved if met is None else resolved.first(num_bodies)
-
-    def _rested(self, resolved: Resolved) -> tuple[BodyMotion, BodyMotion]:
-        """Stop bodies in contact that move by less than ``rest_share`` of ``force_scale`` in a step.
-
-        Networks are never exactly zero, and a body at rest would creep; like static friction, this suppresses small
-        motion.
-        """
-        slowest = self.rest_share * self.force_scale
-        if slowest == 0:
-            return resolved.step, resolved.onward
-        gated = []
-        for motion in (resolved.step, resolved.onward):
-            # A rotation counts by how far it moves a point at a fifth of the contact range, about a body's size.
-            square = motion.displacements.square().sum(dim=-1, keepdim=True)
-            square = square + (0.2 * self.contact_range) ** 2 * motion.spins.square().sum(dim=-1, keepdim=True)
-            share = torch.where(resolved.touching, square / (square + slowest**2), 1.0)
-            gated.append(replace(motion, displacements=motion.displacements * share, spins=motion.spins * share))
-        return gated[0], gated[1]
 
     def _shade(
         self, current: Particles, memory: InertialMemory, static_positions: Tensor, following: Tensor, turned: Tensor
@@ -442,22 +388,6 @@ class InertialDynamics(AbstractDynamics):
         static = static + (shade - memory.static_shade)
         features = put(current.features, memory.index, moving, memory.mask)
         return put(features, memory.static_index, static, memory.static_mask)
-
-
-def _first_motion(positions: Tensor, displacements: Tensor, shares: Tensor, centers: Tensor) -> BodyMotion:
-    """Return the motion that the bodies arrived with: rigid, about their own centres."""
-    fitted = fit_twists(positions, displacements, shares)
-    # Fitted centres are those after the step; turning back gives where each centre was before it.
-    back = rotate(rotation_from_spin(-fitted.spins), centers - fitted.centers)
-    eye = torch.eye(3, dtype=positions.dtype, device=positions.device).expand(*centers.shape, 3)
-    there = (shares.sum(dim=-1) > 0)[..., None]
-    return BodyMotion(
-        centers=centers,
-        displacements=torch.where(there, centers - (fitted.centers - fitted.displacements + back), 0.0),
-        spins=torch.where(there, fitted.spins, 0.0),
-        stretches=eye,
-        strains=torch.zeros_like(eye),
-    )
 
 
 def _elastic(motion: BodyMotion, materials: Materials) -> Float[Tensor, "batch body 3 3"]:

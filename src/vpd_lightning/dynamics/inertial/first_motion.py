@@ -6,7 +6,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
 from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity, MatchedMotion, Surfels
+from vpd_lightning.dynamics.inertial.rigid_motion import fit_twists, rotate, rotation_from_spin
 from vpd_lightning.graph.bodies import label_bodies
 from vpd_lightning.types import Particles, require_finite
 
@@ -79,6 +81,22 @@ def find_first_motion(
         before = _surfels(previous, *gather_index(movable(previous)))
         matched = first_velocity(near, bodies, replace(before, positions=before.positions - origin))
     return FirstMotion(index, mask, seen, bodies, labels.clamp(min=0), matched)
+
+
+def arriving_motion(positions: Tensor, displacements: Tensor, shares: Tensor, centers: Tensor) -> BodyMotion:
+    """Return the motion that the bodies arrived with: rigid, about their own centres."""
+    fitted = fit_twists(positions, displacements, shares)
+    # Fitted centres are those after the step; turning back gives where each centre was before it.
+    back = rotate(rotation_from_spin(-fitted.spins), centers - fitted.centers)
+    eye = torch.eye(3, dtype=positions.dtype, device=positions.device).expand(*centers.shape, 3)
+    there = (shares.sum(dim=-1) > 0)[..., None]
+    return BodyMotion(
+        centers=centers,
+        displacements=torch.where(there, centers - (fitted.centers - fitted.displacements + back), 0.0),
+        spins=torch.where(there, fitted.spins, 0.0),
+        stretches=eye,
+        strains=torch.zeros_like(eye),
+    )
 
 
 def movable(particles: Particles) -> Bool[Tensor, "batch particle"]:

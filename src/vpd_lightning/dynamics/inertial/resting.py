@@ -3,10 +3,12 @@
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
+import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
+from vpd_lightning.dynamics.inertial.contact import Resolved
 from vpd_lightning.randomness import RandomKeys
 
 Tree = TypeVar("Tree")
@@ -16,6 +18,23 @@ def is_slow(motion: BodyMotion, speed: float, arm: float) -> Bool[Tensor, "batch
     """Return which bodies move by less than ``speed`` (metres per step); a spin counts at ``arm`` (metres)."""
     square = motion.displacements.square().sum(dim=-1) + arm**2 * motion.spins.square().sum(dim=-1)
     return square < speed**2
+
+
+def rested(resolved: Resolved, slowest: float, arm: float) -> tuple[BodyMotion, BodyMotion]:
+    """Stop bodies in contact that move by less than ``slowest`` in a step (metres; a rotation counts at ``arm``).
+
+    Networks are never exactly zero, and a body at rest would creep; like static friction, this suppresses small
+    motion.
+    """
+    if slowest == 0:
+        return resolved.step, resolved.onward
+    gated = []
+    for motion in (resolved.step, resolved.onward):
+        square = motion.displacements.square().sum(dim=-1, keepdim=True)
+        square = square + arm**2 * motion.spins.square().sum(dim=-1, keepdim=True)
+        share = torch.where(resolved.touching, square / (square + slowest**2), 1.0)
+        gated.append(replace(motion, displacements=motion.displacements * share, spins=motion.spins * share))
+    return gated[0], gated[1]
 
 
 def rows_of(tree: Tree, rows: Int64[Tensor, " row"], count: int) -> Tree:

@@ -1,0 +1,61 @@
+"""What contact makes of a step: bodies, what stands still, and what is driven, in one solver."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia
+from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, ContactSolver, Resolved
+from vpd_lightning.dynamics.inertial.contact_points import between_bodies, pushed_surface
+from vpd_lightning.dynamics.inertial.driven_bodies import (
+    DrivenBodies,
+    joined_inertia,
+    joined_materials,
+    joined_motion,
+    meet,
+)
+from vpd_lightning.dynamics.inertial.memory import InertialMemory
+
+
+def resolved_contacts(
+    motion: BodyMotion,
+    inertia: Inertia,
+    memory: InertialMemory,
+    positions: Float[Tensor, "batch moving 3"],
+    points: ContactPoints,
+    contacts: Contacts,
+    driven: DrivenBodies | None,
+    driven_friction: Float[Tensor, ""] | None,
+    *,
+    is_mirrored: bool,
+    rest_speed: float,
+    num_iterations: int,
+    max_depth: float,
+) -> Resolved:
+    """Return the step after contact of ``points`` with what stands still (``contacts``), each other and what is driven.
+
+    ``motion`` is the step that bodies would take without; what is driven is left out of the result.
+    """
+    between, materials, masses = between_bodies(points, memory), memory.materials, memory.masses
+    num_bodies, met = masses.shape[1], None
+    if driven is not None:
+        surface = pushed_surface(positions, memory, is_mirrored)
+        met = meet(driven, surface, motion, points, contacts, between)
+    if driven is not None and met is not None:
+        assert driven_friction is not None
+        points, contacts, between = met.points, met.static, met.between
+        count = driven.members.shape[1]
+        motion, inertia = joined_motion(motion, driven.motion), joined_inertia(inertia, count)
+        materials = joined_materials(materials, driven_friction, count)
+        masses = torch.cat([masses, torch.full_like(masses[:, :1], torch.inf).expand(-1, count, -1)], dim=1)
+    solver = ContactSolver(
+        points=points,
+        centers=motion.centers,
+        inertia=inertia,
+        materials=materials,
+        masses=masses,
+        rest_speed=rest_speed,
+        num_driven=masses.shape[1] - num_bodies,
+    )
+    resolved = solver.resolve(motion, contacts, between, num_iterations=num_iterations, max_depth=max_depth)
+    return resolved if met is None else resolved.first(num_bodies)
