@@ -44,7 +44,7 @@ def paper_dynamics() -> HierarchicalGNNDynamics:
         max_abstract_neighbors=2, r_s=0.1, r_a_s=0.3, location_scale=0.1, neighbors_backend="auto",
         edge_capacity=EDGES, max_abstract_edges_per_node=None, compile=False,
         feature_limit=1e4, zero_init_decoders=False, normalized_edges=False, edge_gain=1.0, aggregation="sum",
-        update_features=True,
+        update_features=True, has_driven=False,
     )  # fmt: skip
 
 

@@ -81,6 +81,7 @@ NOT_RUN = {
     "OMP_NUM_THREADS": "takes minutes; the module is looked for",
     "srun": "needs SLURM; tests/reliability has one",
     "vpd-view": "serves until it is stopped; tests/viewer starts it",
+    "vpd-plan": "needs a model that takes actions; tests/commands/test_plan_command.py runs it",
     "vpd-bench": "takes minutes; tests/benchmarks runs the suites",
     "vpd-info | grep": "needs a shell",
     "VPD_DEBUG=1": "needs a shell",
@@ -165,7 +166,7 @@ def test_a_command_can_be_composed(text: str) -> None:
         if "objects.mesh_folder" in settings:  # whose meshes are read at once
             settings.pop("objects.mesh_folder")
         make_plan(places[0], places[1], Path(places[2]), seed, settings, settings.pop("sensor", "none"))
-    elif command in ("eval", "render", "view", "bench", "export"):
+    elif command in ("eval", "render", "view", "bench", "export", "plan"):
         compose(command, [re.sub(r"^(suite=\w+),.*", r"\1", word) for word in words])  # one of several suites
 
 

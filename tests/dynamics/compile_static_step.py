@@ -31,6 +31,7 @@ SMALL = {
     "edge_gain": 1.0,
     "aggregation": "sum",
     "update_features": True,
+    "has_driven": False,
     "compile": False,
     "neighbors_backend": "torch",
 }

@@ -37,6 +37,10 @@ SETTINGS = {
     "shadow_scales": [0.1, 0.4],
     "extent_weight": 0.0,
     "guess_hidden": False,
+    "has_driven": False,
+    "edge_reach": None,
+    "supported_speed": 0.0,
+    "skip_resting": False,
 }
 FIRST_VELOCITY = {
     "match_scales": [0.8, 0.5, 0.3, 0.18, 0.12, 0.08],

@@ -38,6 +38,7 @@ def encoder(has_background=True):
         color_features=False,
         same_pixels=False,
         has_scenery=False,
+        has_driven=False,
     ).double()
 
 

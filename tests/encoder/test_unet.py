@@ -41,6 +41,7 @@ def encoder(**changes):
         "color_features": False,
         "same_pixels": False,
         "has_scenery": False,
+        "has_driven": False,
     }
     return UNetEncoder(**{**arguments, **changes})
 

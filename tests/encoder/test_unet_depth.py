@@ -29,6 +29,7 @@ def encoder(**changes):
         "workspace_min": [-2, -2, -1],
         "workspace_max": [2, 2, 1],
         "initial_depth": 2.0,
+        "has_driven": False,
     }
     torch.manual_seed(0)
     return DepthPredictingEncoder(**{**arguments, **changes})

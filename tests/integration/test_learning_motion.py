@@ -37,13 +37,14 @@ def small_simulator() -> Simulator:
         encoder=UNetEncoder(
             channels=[8, 16, FEATURE_DIM], num_particles=256, workspace_min=WORKSPACE_MIN, workspace_max=WORKSPACE_MAX,
             moving_fraction=None, background=None, use_normals=False, color_features=True, same_pixels=True,
-            has_scenery=False,
+            has_scenery=False, has_driven=False,
         ),
         dynamics=HierarchicalGNNDynamics(
             feature_dim=FEATURE_DIM, hidden_dim=64, message_passing_steps=2, num_abstract_nodes=32,
             max_abstract_neighbors=2, r_s=0.25, r_a_s=0.6, location_scale=0.1, feature_limit=1e4,
             neighbors_backend="auto", edge_capacity=None, max_abstract_edges_per_node=None, compile=False,
             zero_init_decoders=False, normalized_edges=True, edge_gain=3.0, aggregation="mean", update_features=False,
+            has_driven=False,
         ),
         renderer=SplatRenderer(
             feature_dim=FEATURE_DIM, color_features=True, background_frequencies=4, hidden_dim=32, num_layers=2,

@@ -26,7 +26,7 @@ def _dynamics(
         max_abstract_neighbors=MAX_NEIGHBORS, r_s=R_S, r_a_s=R_A_S, location_scale=LOCATION_SCALE,
         neighbors_backend="auto", edge_capacity=None, max_abstract_edges_per_node=None, compile=False,
         feature_limit=1e4, zero_init_decoders=False, normalized_edges=normalized_edges, edge_gain=edge_gain,
-        aggregation=aggregation, update_features=True,
+        aggregation=aggregation, update_features=True, has_driven=False,
     )  # fmt: skip
     # No weight stays at a value that would hide it: biases and layer norms are random too.
     generator = torch.Generator().manual_seed(0)

@@ -151,6 +151,7 @@ def tiny_data(folder: Path, **changes: Any) -> VideoDataModule:
         "load_future": False,
         "sensor": "none",
         "sensor_percent": None,
+        "load_driven": False,
     }
     return VideoDataModule(**{**settings, **changes})
 

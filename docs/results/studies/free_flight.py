@@ -91,7 +91,7 @@ class Training:
             encoder=UNetEncoder(
                 channels=[16, 32, 64, 32, FEATURE_DIM], num_particles=512, workspace_min=WORKSPACE_MIN,
                 workspace_max=WORKSPACE_MAX, moving_fraction=None, background=None, use_normals=False,
-                color_features=True, same_pixels=row.same_pixels, has_scenery=False,
+                color_features=True, same_pixels=row.same_pixels, has_scenery=False, has_driven=False,
             ),
             dynamics=HierarchicalGNNDynamics(
                 feature_dim=FEATURE_DIM, hidden_dim=128, message_passing_steps=row.message_passing_steps,
@@ -99,7 +99,7 @@ class Training:
                 location_scale=0.1, feature_limit=1e4, neighbors_backend="auto", edge_capacity=None,
                 max_abstract_edges_per_node=None, compile=False, zero_init_decoders=row.zero_init,
                 normalized_edges=row.normalized_edges, edge_gain=row.edge_gain, aggregation=row.aggregation,
-                update_features=row.update_features,
+                update_features=row.update_features, has_driven=False,
             ),
             renderer=SplatRenderer(
                 feature_dim=FEATURE_DIM, color_features=True, background_frequencies=4, hidden_dim=96, num_layers=3,

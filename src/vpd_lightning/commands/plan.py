@@ -46,7 +46,7 @@ def _plan(config: Mapping[str, Any]) -> None:
             f"{model.path} was trained without actions, so it cannot plan any.\n"
             "Train one: vpd-train experiment=pushing model=inertial encoder=unet_moving."
         )
-    backend = _backend(config["renderer"])
+    backend = _backend(config["backend"])
     from data_gen.pushing.world import PushingWorld  # after MUJOCO_GL is set
 
     folder = choose_folder(config["out"], beside_checkpoint(model.path, "plan"))
@@ -127,7 +127,7 @@ def _loop(config: Mapping[str, Any], settings: Any) -> Any:
 
 def _backend(wanted: str) -> str:
     if wanted not in ("auto", "egl", "osmesa"):
-        raise ConfigError(f"renderer={wanted} is unknown.\nAllowed: auto, egl, osmesa.")
+        raise ConfigError(f"backend={wanted} is unknown.\nAllowed: auto, egl, osmesa.")
     from data_gen.gl_backend import choose_backend
 
     backend = choose_backend(wanted)

@@ -32,12 +32,17 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "edge_gain": 1.0,
         "aggregation": "sum",
         "update_features": True,
+        "has_driven": False,
     },
     f"{_DYNAMICS}inertial.InertialDynamics": {
         "keep_shape": True,
         "carry_memory": True,
         "extent_weight": 0.0,
         "guess_hidden": False,
+        "has_driven": False,
+        "edge_reach": None,
+        "supported_speed": 0.0,
+        "skip_resting": False,
     },
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},
     "vpd_lightning.simulator.Simulator": {"pixel_gradient_to_motion": 1.0},
@@ -57,9 +62,19 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "num_occluders": 512,
         "shadow_softness": 0.5,
     },
-    "vpd_lightning.data.datamodule.VideoDataModule": {"sensor": "none", "sensor_percent": None},
+    "vpd_lightning.data.datamodule.VideoDataModule": {
+        "sensor": "none",
+        "sensor_percent": None,
+        "load_driven": False,
+    },
     "vpd_lightning.encoder.particles.wide_surface_background.WideSurfaceBackground": {"noise_floor": 0.001},
-    "vpd_lightning.encoder.unet.UNetEncoder": {"color_features": False, "same_pixels": False, "has_scenery": False},
+    "vpd_lightning.encoder.unet.UNetEncoder": {
+        "color_features": False,
+        "same_pixels": False,
+        "has_scenery": False,
+        "has_driven": False,
+    },
+    "vpd_lightning.encoder.unet_depth.DepthPredictingEncoder": {"has_driven": False},
 }
 """By class: arguments added since the first checkpoints, with values that leave those models as they were."""
 

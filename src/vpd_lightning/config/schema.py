@@ -228,7 +228,7 @@ class PlanConfig(TrainedModelConfig):
     num_executed: int = MISSING
     num_decisions: int = MISSING
     max_speed: float = MISSING
-    renderer: str = MISSING
+    backend: str = MISSING
     fps: float = MISSING
     out: str | None = None
 

@@ -67,7 +67,7 @@ class VideoDataModule(pl.LightningDataModule):
         load_future: bool,
         sensor: str,
         sensor_percent: float | None,
-        load_driven: bool = False,
+        load_driven: bool,
     ) -> None:
         """Check the numbers; files are first touched by ``setup``."""
         super().__init__()

@@ -104,7 +104,7 @@ class HierarchicalGNNDynamics(AbstractDynamics):
         edge_gain: float,
         aggregation: str,
         update_features: bool,
-        has_driven: bool = False,
+        has_driven: bool,
     ) -> None:
         super().__init__()
         counts = {

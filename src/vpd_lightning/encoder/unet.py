@@ -37,7 +37,7 @@ class UNetEncoder(UnprojectingEncoder):
         color_features: bool,
         same_pixels: bool,
         has_scenery: bool,
-        has_driven: bool = False,
+        has_driven: bool,
     ):
         super().__init__(
             network=UNetNetwork(channels=channels, in_channels=3),

@@ -37,7 +37,7 @@ class DepthPredictingEncoder(UnprojectingEncoder):
         workspace_min: Sequence[float],
         workspace_max: Sequence[float],
         initial_depth: float,
-        has_driven: bool = False,
+        has_driven: bool,
     ):
         if not 0 < initial_depth < math.inf:
             raise ValueError(f"initial_depth must be a finite number of metres above 0, got {initial_depth}")

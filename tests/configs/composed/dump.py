@@ -31,6 +31,7 @@ ROOTS = {
     "render": ("ckpt=a", "ckpt=a camera=ring num_views=4"),
     "view": ("ckpt=a", "ckpt=a port=0"),
     "export": ("ckpt=a out=b",),
+    "plan": ("ckpt=a", "ckpt=a task=off_table solver.name=mppi"),
     "bench": ("suite=all", "suite=data data.preset=paper"),
 }
 WORDS = (

@@ -40,7 +40,11 @@ class ViewDataModule(VideoDataModule):
         **video: Any,
     ) -> None:
         """Check the numbers; files are first touched by ``setup``."""
-        older = {"sensor": "none", "sensor_percent": None}  # what configurations from before these settings mean
+        older = {
+            "sensor": "none",
+            "sensor_percent": None,
+            "load_driven": False,
+        }  # what configurations from before these settings mean
         super().__init__(**{**older, **video, "cache": False})  # not the full images
         if num_history < 1 or frame_offset < 1 or resolution < 1:
             raise ValueError(
@@ -57,7 +61,7 @@ class ViewDataModule(VideoDataModule):
         """Return the arguments that change nothing beside the others, each with the reason."""
         of_scenes = (
             "rays_per_step", "input_views", "moving_ray_fraction", "moving_ray_margin", "moving_color_threshold",
-            "moving_depth_threshold", "load_future",
+            "moving_depth_threshold", "load_future", "load_driven",
         )  # fmt: skip
         idle = dict.fromkeys(of_scenes, "systems of single camera views see whole images, no rays and no depth")
         if not settings["use_slots"]:

@@ -122,10 +122,10 @@ class InertialDynamics(AbstractDynamics):
         shadow_scales: Sequence[float] | None,
         extent_weight: float,
         guess_hidden: bool,
-        has_driven: bool = False,
-        edge_reach: float | None = None,
-        supported_speed: float = 0.0,
-        skip_resting: bool = False,
+        has_driven: bool,
+        edge_reach: float | None,
+        supported_speed: float,
+        skip_resting: bool,
     ):
         super().__init__()
         for name, value in (("num_bodies", num_bodies), ("num_probes", num_probes)):

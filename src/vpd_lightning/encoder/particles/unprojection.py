@@ -56,7 +56,7 @@ class UnprojectingEncoder(AbstractEncoder):
         color_features: bool,
         same_pixels: bool,
         has_scenery: bool,
-        has_driven: bool = False,
+        has_driven: bool,
     ):
         super().__init__()
         if num_particles < 1:
