@@ -61,7 +61,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_everything_imported_is_required():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    optional = [line for name in ("cluster", "ros", "lerobot", "viewer", "lpips") for line in extras[name]]
+    optional = [line for name in ("cluster", "ros", "lerobot", "viewer", "planning", "lpips") for line in extras[name]]
     lines = [*project["dependencies"], *optional]
     required = {Requirement(line).name for line in lines}
     imported = set()

@@ -24,6 +24,8 @@ NOT_RUN = {
     "config_folder = ": "as above",
     "class TestDrift": "as above",
     "class TestSampled": "a part of a test; tests/test_contract_faults.py runs its like",
+    "vpd.Driven.from_arrays": "needs a model that takes actions; tests/test_actions.py does the same with a small one",
+    "found = vpd.plan": "as above; tests/planning/test_plan.py",
     "renderer.pt2": "needs minutes of torch.export; tests/release/test_renderer_program.py runs it",
 }
 
