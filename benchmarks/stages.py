@@ -21,6 +21,7 @@ FEATURE_DIM = 16
 ROOT = {
     "feature_dim": FEATURE_DIM,
     "color_features": False,
+    "actions": False,
     "scenery": False,
     "checkpoint_dynamics": True,
 }  # keys of the root of conf/train.yaml

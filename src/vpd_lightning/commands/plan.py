@@ -46,11 +46,11 @@ def _plan(config: Mapping[str, Any]) -> None:
             f"{model.path} was trained without actions, so it cannot plan any.\n"
             "Train one: vpd-train experiment=pushing model=inertial encoder=unet_moving."
         )
-    backend = _backend(config["backend"])
+    backend = _backend(config["backend"]) if config["system"] == "model" else None
     from data_gen.pushing.world import PushingWorld  # after MUJOCO_GL is set
 
     folder = choose_folder(config["out"], beside_checkpoint(model.path, "plan"))
-    world = PushingWorld(settings, config["seed"], backend if config["system"] == "model" else None)
+    world = PushingWorld(settings, config["seed"], backend)
     generator = np.random.default_rng([config["seed"], ("place", "off_table", "make_room").index(config["task"])])
     task = draw_task(config["task"], world.places, np.asarray(settings.table.half_size), generator)
     try:
