@@ -78,7 +78,9 @@ def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) 
                     for metric, values in motion.items():
                         rows.setdefault(f"{name}/{metric}", []).append(values[keep].numpy())
                 trajectory += [number] * int(keep.sum())
-    return _summary({name: np.concatenate(values) for name, values in rows.items()}, np.array(trajectory))
+    found = _summary({name: np.concatenate(values) for name, values in rows.items()}, np.array(trajectory))
+    parameters = sum(values.numel() for values in model.simulator.parameters())
+    return {**found, "updates": model.step, "parameters": parameters}
 
 
 def _summary(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]) -> dict[str, Any]:

@@ -28,6 +28,17 @@ FIRST_SEED = 1000
 NUM_SAMPLES, NUM_ITERATIONS, NUM_ELITES, SPREAD = 64, 2, 8, 0.7
 NUM_KNOTS, HOLD, NUM_EXECUTED, NUM_DECISIONS = 6, 4, 2, 10
 MAX_SPEED = 0.016  # metres a frame: 0.4 m/s
+_SETTINGS = {
+    "num_samples": NUM_SAMPLES,
+    "num_iterations": NUM_ITERATIONS,
+    "num_elites": NUM_ELITES,
+    "spread": SPREAD,
+    "num_knots": NUM_KNOTS,
+    "hold": HOLD,
+    "num_executed": NUM_EXECUTED,
+    "num_decisions": NUM_DECISIONS,
+    "max_speed": MAX_SPEED,
+}
 _Z = 1.96
 
 
@@ -112,6 +123,7 @@ def main() -> None:
                 result = json.loads(options.out.read_text()) if options.out.is_file() else {"model": name, "tasks": {}}
                 result["tasks"][key] = found
                 result["rates"] = rates(result["tasks"])
+                result["settings"] = {**_SETTINGS, "dynamics of model": options.dynamics}
                 with AtomicPath(options.out) as path:
                     path.write_text(json.dumps(result, indent=1, sort_keys=True) + "\n")
                 print(key, found, flush=True)

@@ -24,7 +24,7 @@ def nearest_usable(
     """Return the nearest usable point of each query, of equally far ones the first, and whether there is one.
 
     With ``kinds`` a point of the query's own kind does not count. On a CPU compiled loops compare all pairs; without
-    numba, and elsewhere, it is a product of matrices, which many motions side by side make slow (ten times at 64).
+    numba, and elsewhere, it is a product of matrices, whose many large results are slow where motions are side by side.
     """
     compiled = _compiled() if queries.device.type == "cpu" else None
     if compiled is None or queries.dtype not in (torch.float32, torch.float64) or points.shape[1] == 0:
