@@ -28,7 +28,7 @@ from vpd_lightning.testing import (
     LossContract,
     RendererContract,
 )
-from vpd_lightning.types import Particles, SimulatorOutput, VideoBatch
+from vpd_lightning.types import Driven, Particles, SimulatorOutput, VideoBatch
 
 # Any option may hold any of these; where it does, the test takes the small value. All else stays as the file says.
 SMALL = {
@@ -155,6 +155,37 @@ def _lowered(particles: Particles) -> Particles:
     assert particles.moving is not None
     fall = 0.12 * particles.moving[..., None] * torch.tensor([0.0, 0.0, 1.0]).to(particles.positions)
     return replace(particles, positions=particles.positions - fall)
+
+
+class TestDynamicsWithActions(TestDynamics):
+    """With something driven beside the ball, moving into it, every dynamics keeps its contract."""
+
+    @pytest.fixture(params=options("dynamics"), autouse=True)
+    def _option(self, request: pytest.FixtureRequest) -> None:
+        self.section = small(option_section("dynamics", request.param, GROUPS, [*SCENE, "actions=true"]))
+        self.class_name = self.section["_target_"].rpartition(".")[2]
+        self.departures = DEPARTURES.get(self.class_name, {})
+        self.needs_observations = self.class_name in NEEDS_OBSERVATIONS
+
+    def particles(self, *sizes: int, **named: int) -> tuple[Particles, Particles]:
+        """Return particles whose balls a driven ball is about to push."""
+        previous, current = super().particles(*sizes, **named)
+        return previous, replace(current, driven=_beside(current))
+
+
+def _beside(particles: Particles) -> Driven:
+    """A small ball of points at the side of each member's ball, and where it goes: towards its middle."""
+    assert particles.moving is not None and particles.normals is not None
+    share = particles.moving[..., None].to(particles.positions)
+    middle = (share * particles.positions).sum(dim=1, keepdim=True) / share.sum(dim=1, keepdim=True).clamp(min=1)
+    index = torch.arange(24).to(particles.positions)
+    height, angle = 1 - 2 * (index + 0.5) / 24, index * torch.pi * (3 - 5**0.5)
+    ring = (1 - height.square()).sqrt()
+    normals = torch.stack([ring * angle.cos(), ring * angle.sin(), height], dim=-1).expand(len(middle), -1, -1)
+    places = middle + 0.03 * normals + middle.new_tensor([0.2, 0.0, 0.0])
+    step = middle.new_tensor([-0.06, 0.0, 0.0])
+    groups = torch.zeros(places.shape[:2], dtype=torch.int64, device=places.device)
+    return Driven(places, normals, groups, next_positions=places + step, next_normals=normals)
 
 
 class TestPaperDynamicsWithoutDraws(TestDynamics):
