@@ -189,6 +189,14 @@ def test_the_action_is_an_input(option: str) -> None:
     assert torch.equal(without, far), "what is out of reach must not count"
 
 
+def test_the_friction_of_what_is_driven_has_a_gradient_also_where_it_touches_nothing() -> None:
+    dynamics = stage("inertial").train()
+    for driven in (rod((9.0, 0, 0), (0.1, 0, 0)), None):
+        dynamics.zero_grad()
+        next_positions(dynamics, driven).sum().backward()
+        assert dynamics.log_driven_friction.grad is not None and dynamics.log_driven_friction.grad == 0
+
+
 @pytest.mark.parametrize("option", [*WORDS, "persistence"])
 def test_a_model_without_actions_has_no_inputs_for_them(option: str) -> None:
     words = WORDS.get(option, [])

@@ -1,5 +1,7 @@
 """What contact makes of a step: bodies, what stands still, and what is driven, in one solver."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -58,4 +60,10 @@ def resolved_contacts(
         num_driven=masses.shape[1] - num_bodies,
     )
     resolved = solver.resolve(motion, contacts, between, num_iterations=num_iterations, max_depth=max_depth)
-    return resolved if met is None else resolved.first(num_bodies)
+    if met is not None:
+        return resolved.first(num_bodies)
+    if driven_friction is None:
+        return resolved
+    # Nothing was touched: a gradient of zero all the same, because on several devices each weight must have one.
+    step = replace(resolved.step, displacements=resolved.step.displacements + 0 * driven_friction)
+    return replace(resolved, step=step)
