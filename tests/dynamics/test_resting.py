@@ -1,0 +1,128 @@
+"""What rests is left alone, members of a batch by themselves; what is pushed is not."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.dynamics.solids import even_cube
+from tests.dynamics.test_inertial import dynamics
+from vpd_lightning.dynamics.inertial.resting import rows_of, with_rows
+from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.types import Driven, Particles
+
+HALF = 0.1
+SETTINGS = {
+    "has_driven": True,
+    "supported_speed": 0.1,
+    "edge_reach": 1.5,
+    "first_velocity": None,
+    "shadow_scales": None,
+}
+
+
+def cube_on_a_table() -> Particles:
+    """A cube that stands on a table whose edge is 10 cm beside it; 2 cm of its foot were not seen. Batch of 1."""
+    positions, normals = even_cube(6, HALF)
+    seen = (normals[:, 2] > -0.5) & (positions[:, 2] > -HALF + 0.02)
+    cube, facing = positions[seen] + torch.tensor([0, 0, HALF]).double(), normals[seen]
+    axis = torch.arange(-20, 21, dtype=torch.float64) / 40
+    x, y = (values.flatten() for values in torch.meshgrid(axis, axis, indexing="ij"))
+    open_ = ((x.abs() > HALF) | (y.abs() > HALF)) & (x < 0.2)
+    table = torch.stack([x, y, torch.zeros_like(x)], dim=-1)[open_]
+    places = torch.cat([cube, table])
+    up = torch.tensor([0, 0, 1.0]).double().expand_as(table)
+    colors = torch.full_like(places, 0.5)
+    moving = torch.arange(len(places)) < len(cube)
+    features = torch.rand(len(places), 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return Particles(
+        places[None], features[None], colors=colors[None], moving=moving[None], normals=torch.cat([facing, up])[None]
+    )
+
+
+def plate(x: float, step: float, count: int = 1) -> Driven:
+    """A square that faces +x at ``x`` and goes by ``step``, and then by as much again."""
+    axis = torch.linspace(-0.08, 0.08, 7, dtype=torch.float64)
+    y, z = (values.flatten() for values in torch.meshgrid(axis, axis, indexing="ij"))
+    points = torch.stack([torch.full_like(y, x), y, z + HALF], dim=-1)[None].expand(count, -1, -1)
+    normals = torch.tensor([1.0, 0, 0]).double().expand_as(points)
+    groups = torch.zeros(points.shape[:2], dtype=torch.int64)
+    shift = torch.tensor([step, 0, 0]).double()
+    return Driven(points, normals, groups, next_positions=points + shift, next_normals=normals)
+
+
+def model(**changes):
+    torch.manual_seed(0)
+    return dynamics(**{**SETTINGS, **changes}).eval()
+
+
+def rolled(made, driven: Driven, num_steps: int, with_grad: bool = False) -> list[Particles]:
+    scene = cube_on_a_table()
+    scene = Particles(
+        *(values.expand(len(driven.mask), *values.shape[1:]) for values in (scene.positions, scene.features)),
+        colors=scene.colors.expand(len(driven.mask), -1, -1),
+        moving=scene.moving.expand(len(driven.mask), -1),
+        normals=scene.normals.expand(len(driven.mask), -1, -1),
+        driven=driven,
+    )
+    keys = RandomKeys.fixed(len(driven.mask))
+    previous, current, states = scene, scene, []
+    with torch.set_grad_enabled(with_grad):
+        memory = made.initialize(previous, current, keys)
+        for step in range(num_steps):
+            following, memory = made(previous, current, memory, keys, step)
+            shift = driven.next_positions - driven.positions
+            now = replace(current.driven, positions=current.driven.next_positions)
+            following = replace(following, driven=replace(now, next_positions=now.positions + shift))
+            previous, current = current, following
+            states.append(following)
+    return states
+
+
+def test_a_resting_scene_stays_as_it_is_bit_for_bit_and_a_pushed_one_moves() -> None:
+    made = model(skip_resting=True)
+    still = rolled(made, plate(-0.5, 0.0), 5)
+    assert all(torch.equal(state.positions, cube_on_a_table().positions) for state in still)
+    pushed = rolled(made, plate(-0.11, 0.02), 5)[-1]
+    moved = (pushed.positions - cube_on_a_table().positions)[0, cube_on_a_table().moving[0]].mean(dim=0)
+    assert moved[0].item() == pytest.approx(0.09, abs=0.01) and moved[1:].abs().max() < 0.01
+
+
+def test_what_is_pushed_goes_as_it_goes_without_skipping() -> None:
+    driven = plate(-0.11, 0.02)
+    skipped, whole = (rolled(model(skip_resting=skip), driven, 5)[-1].positions for skip in (True, False))
+    assert (skipped - whole).abs().max() < 1e-3
+
+
+def test_members_rest_by_themselves() -> None:
+    made = model(skip_resting=True)
+    away, near = plate(-0.5, 0.0), plate(-0.11, 0.02)
+    names = ("positions", "normals", "groups", "mask", "next_positions", "next_normals")
+    both = Driven(**{name: torch.cat([getattr(away, name), getattr(near, name)]) for name in names})
+    together = rolled(made, both, 4)[-1]
+    for number, driven in enumerate((away, near)):
+        alone = rolled(made, driven, 4)[-1]
+        assert torch.allclose(together.positions[number], alone.positions[0], atol=1e-12)
+        assert torch.allclose(together.features[number], alone.features[0], atol=1e-12)
+
+
+def test_with_gradients_nothing_is_skipped() -> None:
+    made = model(skip_resting=True)
+    calls = []
+    step = made._step
+    made._step = lambda *given: calls.append(None) or step(*given)
+    rolled(made, plate(-0.5, 0.0), 2)
+    assert not calls
+    rolled(made, plate(-0.5, 0.0), 2, with_grad=True)
+    assert len(calls) == 2
+
+
+def test_rows_are_taken_and_put_back() -> None:
+    driven = plate(0.0, 0.1, count=3)
+    rows = torch.tensor([2, 0])
+    some = rows_of(driven, rows, 3)
+    assert len(some.positions) == 2 and torch.equal(some.groups, driven.groups[rows])
+    changed = replace(some, positions=some.positions + 1.0)
+    back = with_rows(driven, rows, changed, 3)
+    assert torch.equal(back.positions[1], driven.positions[1]) and torch.equal(back.positions[rows], changed.positions)
+    assert back.features is None
