@@ -1,7 +1,7 @@
 """Actions: a motion that is given, checked and handed to the dynamics step by step."""
 
-from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from torch import Tensor
 from vpd_lightning.errors import ActionError
 from vpd_lightning.geometry.driven_pixels import seen_through_share
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Driven, Particles, RGBDFrames
+from vpd_lightning.types import Driven, Particles, RGBDFrames, mapped_tensors
 
 Tree = TypeVar("Tree")
 
@@ -109,13 +109,14 @@ def after_step(following: Particles, current: Particles) -> Particles:
 
 
 def expanded(tree: Tree, count: int) -> Tree:
-    """Return tensors and dataclasses of tensors, whose batch axis of 1 is expanded to ``count``; nothing is copied."""
-    value: Any = tree
-    if isinstance(value, Tensor):
-        return value.expand(count, *value.shape[1:]) if value.dim() and value.shape[0] == 1 else value  # type: ignore[return-value]
-    if isinstance(value, RandomKeys):
-        return replace(value, sample_index=list(value.sample_index) * count)  # type: ignore[return-value]
-    if is_dataclass(value) and not isinstance(value, type):
-        parts = {item.name: expanded(getattr(value, item.name), count) for item in fields(value)}
-        return replace(value, **parts)  # type: ignore[return-value]
-    return tree
+    """Return tensors and dataclasses of tensors, whose batch axis of 1 is expanded to ``count``; nothing is copied.
+
+    The draws of keys become the same for all: each member is what it would be alone.
+    """
+    if isinstance(tree, RandomKeys):
+        return replace(tree, sample_index=list(tree.sample_index) * count)
+
+    def grown(values: Tensor) -> Tensor:
+        return values.expand(count, *values.shape[1:]) if values.dim() and len(values) == 1 else values
+
+    return mapped_tensors(grown, tree)  # type: ignore[no-any-return]

@@ -1,7 +1,7 @@
 """What crosses a stage border: cameras, RGB-D frames, particles, rays, rendered rays and training batches."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import torch
@@ -24,6 +24,17 @@ Border = TypeVar("Border", bound="_Border")
 def _moved(value: Any, *args: Any, **kwargs: Any) -> Any:
     """Move tensors and border dataclasses; leave plain values alone. A dtype touches floating tensors only."""
     return value.to(*args, **kwargs) if isinstance(value, (Tensor, _Border)) else value
+
+
+def mapped_tensors(function: Callable[..., Tensor], tree: Any, *others: Any) -> Any:
+    """Apply a function to every tensor of a dataclass of tensors, however deep, with those of others at its place."""
+    if isinstance(tree, Tensor):
+        return function(tree, *others)
+    if not is_dataclass(tree) or isinstance(tree, type):
+        return tree
+    names = [item.name for item in fields(tree)]
+    parts = {name: mapped_tensors(function, *(getattr(one, name) for one in (tree, *others))) for name in names}
+    return replace(tree, **parts)
 
 
 # None may be given; readers always find a tensor (see Particles.__post_init__), and the annotations say so.

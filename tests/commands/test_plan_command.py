@@ -67,6 +67,7 @@ def test_the_recorded_action_is_given_to_evaluations_and_films(run: Path, tmp_pa
     ("words", "message"),
     [
         ("task=juggle", "Allowed: place, off_table, make_room."),
+        ("data.folder=somewhere", "data.folder has no effect here"),
         ("system=luck", "Allowed: model, truth, nothing."),
         ("solver.name=prayer", "Allowed: cem, mppi, random."),
         ("solver.num_elites=0", "num_elites from 1 to num_samples"),

@@ -106,6 +106,18 @@ def test_members_rest_by_themselves() -> None:
         assert torch.allclose(together.features[number], alone.features[0], atol=1e-12)
 
 
+def test_hidden_sides_are_drawn_of_those_that_move_and_of_those_that_rest() -> None:
+    made = model(skip_resting=True, guess_hidden=True, mirror_hidden=True)
+    names = ("positions", "normals", "groups", "mask", "next_positions", "next_normals")
+    one, other = plate(-0.5, 0.0), plate(-0.11, 0.02)
+    both = Driven(**{name: torch.cat([getattr(one, name), getattr(other, name)]) for name in names})
+    first, *_, last = rolled(made, both, 4)
+    assert first.hidden_side is not None and last.hidden_side is not None
+    went = (last.hidden_side.positions - first.hidden_side.positions).norm(dim=-1)
+    assert bool(last.hidden_side.mask.any(dim=1).all()), "each cube has a hidden side"
+    assert went[0].max() < 1e-3 and went[1][last.hidden_side.mask[1]].min() > 0.03
+
+
 def test_with_gradients_nothing_is_skipped() -> None:
     made = model(skip_resting=True)
     calls = []

@@ -8,7 +8,7 @@ import torch
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.sleeping import SleepingDynamics
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Driven, Particles
 
 SETTINGS = {
     "location_scale": 0.1,
@@ -292,3 +292,31 @@ def test_members_of_a_partly_sleeping_batch_draw_with_their_own_keys():
         own, _ = roll(sleeping(Shaken()), alone, 8, keys=RandomKeys(1, 2, [index]))
         for state, expected in zip(states, own, strict=True):
             torch.testing.assert_close(state.positions[member], expected.positions[0], rtol=0, atol=0)
+
+
+def driven_at(x, step=0.0):
+    """A driven point beside the block, and where it goes."""
+    place = torch.tensor([[[x, 0.0, 0.1]]], dtype=torch.float64)
+    up = torch.tensor([[[0.0, 0.0, 1.0]]], dtype=torch.float64)
+    shift = torch.tensor([step, 0.0, 0.0], dtype=torch.float64)
+    groups = torch.zeros(1, 1, dtype=torch.int64)
+    return Driven(place, up, groups, next_positions=place + shift, next_normals=up)
+
+
+@pytest.mark.parametrize(
+    ("driven", "is_woken"),
+    [(driven_at(0.3, 0.05), True), (driven_at(0.3), False), (driven_at(2.0, 0.05), False)],
+    ids=["comes near", "stands beside it", "moves far away"],
+)
+def test_what_is_driven_wakes_what_it_comes_near(driven, is_woken):
+    dynamics, start = sleeping(), scene((block(0.0), (0, 0, 0)))
+    states, memories = roll(dynamics, start, 6)
+    assert memories[-1].asleep.all()
+    calls = dynamics.dynamics.num_calls
+    current = replace(states[-1], driven=driven)
+
+    following, _ = dynamics(states[-2], current, memories[-1], RandomKeys.fixed(1), 6)
+
+    assert (dynamics.dynamics.num_calls > calls) == is_woken
+    assert bool(dynamics.last_awake_share > 0) == is_woken
+    assert torch.equal(following.features, current.features) != is_woken, "what woke was not advanced"

@@ -251,3 +251,19 @@ def test_same_pixels_pad_where_there_are_fewer_candidates_than_particles():
     assert not made.positions[:, 8:].any() and not made.features[:, 8:].any()
     more = encoder(same_pixels=True, num_particles=100)(data, RandomKeys(0, 0, [0, 1]), "current").particles
     assert more.mask.shape == (2, 100) and more.mask.sum(dim=1).tolist() == [8, 8]
+
+
+def test_a_background_takes_the_shape_of_what_is_fitted_and_loaded():
+    data = frames(batch=1)
+    free = {"num_views": None, "height": None, "width": None, "depth_threshold": 0.02}
+    model, other = BackgroundModel(**free), BackgroundModel(**free)
+    model.fit(data.rgb[0], data.depth[0], data.cameras[0])
+    assert model.depth.shape == data.depth[0].shape and bool(model.is_fitted)
+
+    other.load_state_dict(model.state_dict())
+
+    nearer = RGBDFrames(data.rgb, data.depth - 0.1, data.cameras)
+    assert torch.equal(other(nearer), model(nearer)) and bool(other(nearer).all())
+    fixed = BackgroundModel(num_views=1, height=8, width=8, depth_threshold=0.02)
+    with pytest.raises(DataError, match="the model expects"):
+        fixed.fit(data.rgb[0], data.depth[0], data.cameras[0])

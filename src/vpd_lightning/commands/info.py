@@ -38,6 +38,8 @@ _EXTRAS = {
     "rosbags": ("importing ROS bags", "pip install 'vpd-lightning[ros]'"),
     "pyarrow": ("importing LeRobot data sets", "pip install 'vpd-lightning[lerobot]'"),
     "hydra-submitit-launcher": ("many runs on a cluster", "pip install 'vpd-lightning[slurm]'"),
+    "pytorch-mppi": ("planning with MPPI", "pip install 'vpd-lightning[planning]'"),
+    "gymnasium": ("the pushing scene as an environment", "pip install 'vpd-lightning[planning]'"),
     "av": ("importing LeRobot videos", "pip install 'vpd-lightning[lerobot]'"),
 }
 RELEASED = "released"

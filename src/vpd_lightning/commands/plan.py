@@ -92,6 +92,8 @@ def _loop(config: Mapping[str, Any], settings: Any) -> Any:
     for name, allowed in (("task", KINDS), ("system", ("model", "truth", "nothing"))):
         if config[name] not in allowed:
             raise ConfigError(f"{name}={config[name]} is unknown.\nAllowed: {', '.join(allowed)}.")
+    if config["data"]["folder"] is not None:
+        raise ConfigError("data.folder has no effect here: vpd-plan makes its own world, by seed.\nRemove it.")
     for name in ("num_knots", "hold", "num_executed", "num_decisions"):
         if config[name] < 1:
             raise ConfigError(f"{name}={config[name]} is out of range.\nAllowed: 1 or more.")

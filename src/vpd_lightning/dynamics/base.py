@@ -14,6 +14,10 @@ class AbstractDynamics(nn.Module, ABC):
 
     Only the two observed frames lack correspondences. What a dynamics wants to carry from step to step is its
     ``memory``: plain tensors in a dataclass, rebuildable from any pair of particle sets, so that edits rebuild it.
+
+    One that takes actions has an attribute ``has_driven`` that is true, and finds what is driven in
+    ``current.driven``, with where it will be after the step in ``next_positions`` and ``next_normals``. What it
+    returns of that does not matter: the simulator puts it where it was given to be.
     """
 
     def initialize(self, previous: Particles, current: Particles, keys: RandomKeys) -> Any:

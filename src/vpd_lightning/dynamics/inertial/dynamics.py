@@ -286,8 +286,8 @@ class InertialDynamics(AbstractDynamics):
             positions = take(current.positions, memory.index) - memory.origin
             surface = pushed_surface(positions, memory, self.mirror_hidden)
             is_idle = is_idle & ~is_pushed(driven_bodies(driven, memory.origin), surface, memory.motion)
-        if not bool(is_idle.any()):
-            return self._step(current, memory)
+        if not bool(is_idle.any()) or self.hidden_guess is not None and current.hidden_side is None:
+            return self._step(current, memory)  # also where there are no hidden sides yet to keep
         rows = (~is_idle).nonzero()[:, 0]
         if len(rows) == 0:
             return current, memory

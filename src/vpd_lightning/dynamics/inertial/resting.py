@@ -1,7 +1,7 @@
 """Scenes in which nothing moves and nothing is about to be pushed are left alone."""
 
-from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
 from vpd_lightning.dynamics.inertial.contact import Resolved
-from vpd_lightning.randomness import RandomKeys
+from vpd_lightning.types import mapped_tensors
 
 Tree = TypeVar("Tree")
 
@@ -39,29 +39,20 @@ def rested(resolved: Resolved, slowest: float, arm: float) -> tuple[BodyMotion, 
 
 def rows_of(tree: Tree, rows: Int64[Tensor, " row"], count: int) -> Tree:
     """Return some members of tensors and dataclasses of tensors whose batch axis has ``count`` members."""
-    value: Any = tree
-    if isinstance(value, Tensor):
-        return value.index_select(0, rows) if value.dim() and len(value) == count else value  # type: ignore[return-value]
-    if isinstance(value, RandomKeys):
-        return replace(value, sample_index=[value.sample_index[row] for row in rows.tolist()])  # type: ignore[return-value]
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{item.name: rows_of(getattr(value, item.name), rows, count) for item in fields(value)})  # type: ignore[return-value]
-    return tree
+
+    def taken(values: Tensor) -> Tensor:
+        return values.index_select(0, rows) if values.dim() and len(values) == count else values
+
+    return mapped_tensors(taken, tree)  # type: ignore[no-any-return]
 
 
 def with_rows(tree: Tree, rows: Int64[Tensor, " row"], new: Tree, count: int) -> Tree:
-    """Return the members of ``tree`` with those at ``rows`` replaced by those of ``new``; what is the same stays."""
-    value, other = tree, new
-    old: Any = value
-    if isinstance(old, Tensor) and isinstance(other, Tensor):
-        return old.index_copy(0, rows, other.to(old.dtype)) if old.dim() and len(old) == count else old  # type: ignore[return-value]
-    if is_dataclass(old) and not isinstance(old, type):
-        parts = {
-            item.name: with_rows(getattr(old, item.name), rows, getattr(other, item.name), count)
-            for item in fields(old)
-        }
-        return replace(old, **parts)  # type: ignore[return-value]
-    return tree
+    """Return the members of ``tree`` with those at ``rows`` replaced by those of ``new``."""
+
+    def put(values: Tensor, other: Tensor) -> Tensor:
+        return values.index_copy(0, rows, other.to(values.dtype)) if values.dim() and len(values) == count else values
+
+    return mapped_tensors(put, tree, new)  # type: ignore[no-any-return]
 
 
 def members_in_use(bodies: Float[Tensor, "batch body moving"]) -> Bool[Tensor, "batch body"]:
