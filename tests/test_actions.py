@@ -84,7 +84,6 @@ def test_what_stands_in_front_of_it_is_not_taken_for_it() -> None:
 
 
 def test_points_take_the_pixel_that_shows_them() -> None:
-    frames = seen()
     points = torch.zeros(1, 4, 3, dtype=torch.float64)
     points[0, :, 0] = torch.arange(4)
     shown = torch.tensor([[True, False, True, False]])
@@ -92,7 +91,6 @@ def test_points_take_the_pixel_that_shows_them() -> None:
     index, is_seen = nearest_pixels(driven, points, shown)
     assert index.tolist() == [[0, 2, 2]] and bool(is_seen.all())
     assert not nearest_pixels(driven, points, torch.zeros_like(shown))[1].any()
-    assert frames.driven is not None
 
 
 def test_a_camera_that_sees_through_the_points_contradicts_them() -> None:
