@@ -101,7 +101,8 @@ def run_with_model(
     """Solve a task by planning with a trained simulator from what the cameras see.
 
     The task names its bodies by where they are at first (a person would click on them); from then on each is the
-    cluster of particles nearest to where it was predicted to be. ``progress`` is called with the number of each
+    cluster of particles nearest to where it was predicted to be. Where the task seems solved, nothing is planned and the
+    tool stays until the next look. ``progress`` is called with the number of each
     decision, how many there are and the cost of its plan.
     """
     episode, start = Episode(num_steps=loop.num_executed * loop.tool.hold), None
@@ -113,6 +114,12 @@ def run_with_model(
         began = time.perf_counter()
         scene = _encoded(simulator, world, before, now, input_views)
         bodies = _bodies(scene.current, expected)
+        expected = _middles(scene.current, bodies)
+        if task.seems_solved(expected.numpy()):
+            start = None
+            _note(episode, world, now, None, 0.0)
+            before = _act(world, np.repeat(world.command[None], episode.num_steps, axis=0))
+            continue
         found = plan(
             simulator,
             scene,
@@ -125,26 +132,30 @@ def run_with_model(
         )
         episode.seconds.append(time.perf_counter() - began)
         start = found.later(loop.num_executed)
-        after = found.states[episode.num_steps - 1]
-        expected = torch.stack([after.positions[0, chosen].double().mean(dim=0).cpu() for chosen in bodies])
+        expected = _middles(found.states[episode.num_steps - 1], bodies)
         _note(episode, world, now, found, found.cost)
         if progress is not None:
             progress(decision, loop.num_decisions, found.cost)
-        goals = loop.frames(found.actions, world.command)
-        world.advance(goals[:-1])
-        before = world.observe()
-        world.advance(goals[-1:])
+        before = _act(world, loop.frames(found.actions, world.command))
     episode.moments.append(world.observe())
     episode.plans.append(None)
     return _judged(episode, world, task)
 
 
 def run_with_truth(world: TrueWorld, task: Task, loop: Loop, seed: int = 0) -> Episode:
-    """Solve a task by planning with the world itself: the ceiling of what the same planner can reach."""
+    """Solve a task by planning with the world itself: the ceiling of what the same planner can reach.
+
+    As with a model, the tool stays while the task seems solved.
+    """
     episode, start = Episode(), torch.zeros(loop.num_knots, 2)
     chosen = [torch.arange(len(world.places)) == number for number in range(len(world.places))]
     world.advance(world.command[None])
     for decision in range(loop.num_decisions):
+        if task.seems_solved(world.places):
+            start = torch.zeros(loop.num_knots, 2)
+            _note(episode, world, None, None, 0.0)
+            world.advance(np.repeat(world.command[None], loop.num_executed * loop.tool.hold, axis=0))
+            continue
         began = time.perf_counter()
         cost = task.cost(chosen)
 
@@ -164,6 +175,19 @@ def run_without_action(world: TrueWorld, task: Task, loop: Loop) -> Episode:
     episode = Episode()
     world.advance(np.repeat(world.command[None], 1 + loop.num_decisions * loop.num_executed * loop.tool.hold, axis=0))
     return _judged(episode, world, task)
+
+
+def _act(world: World, goals: NDArray[np.float64]) -> Moment:
+    """Command a place for each frame; returns what is seen one frame before the last."""
+    world.advance(goals[:-1])
+    before = world.observe()
+    world.advance(goals[-1:])
+    return before
+
+
+def _middles(state: Particles, bodies: list[Bool[Tensor, " particle"]]) -> Tensor:
+    """Return the middle of each body's particles (body, 3), metres."""
+    return torch.stack([state.positions[0, chosen].double().mean(dim=0).cpu() for chosen in bodies])
 
 
 def _note(episode: Episode, world: TrueWorld, moment: Moment | None, found: Plan | None, cost: float) -> None:

@@ -54,11 +54,12 @@ def episode_frames(simulator: Simulator, world: World, task: Task, episode: Epis
     for number, (now, then, plan) in enumerate(
         zip(episode.moments[:-1], episode.moments[1:], episode.plans[:-1], strict=True)
     ):
-        assert plan is not None
-        reached = plan.states[episode.num_steps - 1]
-        drawn = (simulator.render([reached], camera)[0, 0].clamp(0, 1) * 255).round().byte().cpu().numpy()
+        drawn, planned = now.rgb[0], "seems solved: stays"
+        if plan is not None:
+            reached, planned = plan.states[episode.num_steps - 1], "planned"
+            drawn = (simulator.render([reached], camera)[0, 0].clamp(0, 1) * 255).round().byte().cpu().numpy()
         panels = []
-        titles = (f"seen, decision {number + 1}", "planned", "what happened")
+        titles = (f"seen, decision {number + 1}", planned, "what happened")
         for picture, title in zip((now.rgb[0], drawn, then.rgb[0]), titles, strict=True):
             shown = picture.copy()
             shown[mark] = _GREEN

@@ -19,7 +19,7 @@ ROOM_RADIUS = 0.10  # metres, of the disc that should be free of centres
 FALLEN = -0.05  # metres, of a centre, below the table's top
 _PUSH = (0.10, 0.16)  # metres, from a body's first place to its goal
 _FROM_EDGE = 0.08  # metres, of a goal
-_MARGIN = 0.02  # metres, by which plans leave a region
+_MARGIN = 0.02  # metres, by which plans leave a region, and observed bodies must be where they should
 _APPROACH = 0.3  # of the distance between tool and body, beside the cost of the task
 _MAX_TRIALS = 1000
 
@@ -44,6 +44,16 @@ class Task:
             inside = np.hypot(*(places[:, :2] - self.goal).T) < ROOM_RADIUS
             return not bool((inside & (places[:, 2] > FALLEN)).any())
         return bool(np.hypot(*(places[0, :2] - self.goal)) < PLACE_TOLERANCE and places[0, 2] > FALLEN)
+
+    def seems_solved(self, places: NDArray[np.float64]) -> bool:
+        """Return whether a tool may rest where bodies were observed at ``places`` (body, 3): solved with a margin."""
+        if self.kind == "off_table":
+            return self.is_solved(places)
+        away = np.hypot(*(places[:, :2] - self.goal).T)
+        on_table = places[:, 2] > FALLEN
+        if self.kind == "make_room":
+            return not bool(((away < ROOM_RADIUS + _MARGIN) & on_table).any())
+        return bool(away[0] < PLACE_TOLERANCE - _MARGIN and on_table[0])
 
     def distance(self, places: NDArray[np.float64]) -> float:
         """Return how far true centres (body, 3) are from solving the task (metres)."""

@@ -1,5 +1,6 @@
 """A tool that is shifted in a plane without turning: from velocities to the motion of its points."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -44,15 +45,38 @@ class PlanarTool:
             places.append(place)
         return torch.stack(places, dim=1)
 
+    def along(self, driven: Driven, stops: Float[Tensor, "stop 2"]) -> Driven:
+        """Return the motion (axes ``step driven``) of a tool that is at ``driven`` now and goes from stop to stop.
+
+        It goes straight, at ``max_speed``, within the limits; at least one step, in which it may stay.
+        """
+        here = self.middle(driven)
+        low, high = (torch.as_tensor(end).to(here) for end in (self.low, self.high))
+        places, place = [], here
+        for stop in stops.to(here):
+            way = torch.maximum(torch.minimum(stop, high), low) - place
+            count = max(1, math.ceil(float(way.norm()) / self.max_speed - 1e-6))
+            places += [place + way * (step + 1) / count for step in range(count)]
+            place = places[-1]
+        return self._carried(driven, torch.stack(places or [here])[None])[0]
+
+    @staticmethod
+    def middle(driven: Driven) -> Float[Tensor, "2"]:
+        """Return where the middle of the tool's points is now, x and y (batch axis of 1)."""
+        return driven.positions[0][driven.mask[0], :2].mean(dim=0)
+
     def motion(self, driven: Driven, actions: Float[Tensor, "batch knot 2"]) -> Driven:
         """Return the motion (axes ``batch step driven``) of a tool that is at ``driven`` now (batch axis of 1)."""
-        here = driven.positions[0]
-        start = here[driven.mask[0], :2].mean(dim=0)
-        shift = torch.nn.functional.pad(self.path(start, actions.to(start)) - start, (0, 1))
+        start = self.middle(driven)
+        return self._carried(driven, self.path(start, actions.to(start)))
+
+    def _carried(self, driven: Driven, places: Float[Tensor, "batch step 2"]) -> Driven:
+        """Return the tool at each place of its middle (axes ``batch step driven``)."""
+        shift = torch.nn.functional.pad(places - self.middle(driven), (0, 1))
         count, steps = shift.shape[:2]
 
         def held(values: Tensor) -> Tensor:
             return values[:, None].expand(count, steps, *values.shape[1:])
 
         moved = replace(driven, features=None, next_positions=None, next_normals=None).mapped(held)
-        return replace(moved, positions=here + shift[:, :, None])
+        return replace(moved, positions=driven.positions[0] + shift[:, :, None])

@@ -12,7 +12,7 @@ def sentence(screen: Screen) -> str:
     rollouts = screen.rollouts()
     if len(rollouts) > 1:
         first, second = (screen.session.label(rollout) for rollout in rollouts)
-        return f"The same throw twice, as the model predicts it: **{first}**, and **{second}**."
+        return f"The same scene twice, as the model predicts it: **{first}**, and **{second}**."
     if screen.mode == PICTURE:
         return "What the model predicts, from any side. Drag to look around."
     said = "The model saw **two frames** and predicts the rest. Bright in the error is wrong."

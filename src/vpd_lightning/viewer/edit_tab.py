@@ -66,11 +66,12 @@ class EditTab:
     def _show_selection(self) -> None:
         body, count = self.session.selected_body, int(self.session.selected.sum())
         self.clusters.value = self.clusters.options[0 if body is None else body + 1]
-        what = f"**{self._name()}** is selected: {count} particles" if count else "Click a body to select it."
+        what = f"**{self.name}** is selected: {count} particles" if count else "Click a body to select it."
         self.status.content = what + ("  \nDrag a rectangle around what to select." if self._armed else "")
         self.handles.show_selected()
 
-    def _name(self) -> str:
+    @property
+    def name(self) -> str:
         """Return what is selected, in words."""
         body = self.session.selected_body
         return "the selection" if body is None else f"the {self.session.body_names()[body]}"
@@ -126,14 +127,14 @@ class EditTab:
 
     def delete(self) -> None:
         """Take away what is selected."""
-        self._apply(Delete(self.session.need_selection()), f"without {self._name()}")
+        self._apply(Delete(self.session.need_selection()), f"without {self.name}")
 
     def _apply(self, operation: Any, label: str) -> None:
         self.panel.edit(lambda: self.session.apply(operation, label))
 
     def _duplicate(self) -> None:
         """Put a copy where the camera sees it: beside the original, across the line of sight, and not over it."""
-        selector, name = self.session.need_selection(), self._name()
+        selector, name = self.session.need_selection(), self.name
         points = self.session.now.states[0].positions[0][self.session.selected].double().cpu().numpy()
         right = self.panel.screen.viewpoint().cameras(100).cam_to_world[0, :3, 0].double().numpy()
         right[2] = 0.0
@@ -148,17 +149,17 @@ class EditTab:
         )
 
     def _set_velocity(self) -> None:
-        name = self._name()
+        name = self.name
         self._apply(SetVelocity(self.session.need_selection(), tuple(self.velocity.value)), f"{name} thrown otherwise")
 
     def _scale(self) -> None:
-        name, factor = self._name(), self.factor.value
+        name, factor = self.name, self.factor.value
         self._apply(Scale(self.session.need_selection(), factor), f"{name} scaled by {factor:g}")
 
     def move(self, shift: list[float], wxyz: tuple[float, ...], center: list[float]) -> None:
         """Turn what is selected about ``center``, then shift it (metres)."""
         turn = (wxyz[0], wxyz[1], wxyz[2], wxyz[3])
-        self._apply(Move(self.session.need_selection(), shift, turn, center), f"{self._name()} moved")
+        self._apply(Move(self.session.need_selection(), shift, turn, center), f"{self.name} moved")
 
     def _move(self) -> None:
         """Show the scene from the browser's camera at its first step, where what is selected can be dragged."""

@@ -9,6 +9,7 @@ import numpy as np
 import viser
 
 from vpd_lightning.errors import VPDError
+from vpd_lightning.viewer.act_tab import ActTab
 from vpd_lightning.viewer.captions import figures, sentence
 from vpd_lightning.viewer.edit_tab import EditTab
 from vpd_lightning.viewer.export_tab import ExportTab
@@ -70,6 +71,10 @@ class Panel(TabHost):
             self.view_tab = ViewTab(self, num_steps)
         with tabs.add_tab("Edit"):
             self.edit_tab = EditTab(self)
+        self.act_tab = None
+        if self.session.tool is not None:
+            with tabs.add_tab("Act"):
+                self.act_tab = ActTab(self)
         with tabs.add_tab("Save"):
             self.export_tab = ExportTab(self)
         self.play.on_click(lambda _: self.act(self.toggle_play))
@@ -169,6 +174,8 @@ class Panel(TabHost):
         """Show a scene that was just edited: from its beginning, playing."""
         self._allow_steps()
         self.edit_tab.refresh()
+        if self.act_tab is not None:
+            self.act_tab.refresh()
         self.presets.refresh()
         self.go_to(0)
         self.simulate_again()
@@ -308,6 +315,8 @@ class Panel(TabHost):
         self.drawing.cameras(in_space and self.view_tab.cameras_shown.value, self.screen.view)
         self.drawing.measured(step if in_space and self.view_tab.truth_shown.value else None, size)
         self.edit_tab.show_handles(in_space and step == 0)
+        if self.act_tab is not None:
+            self.act_tab.show_handles(in_space and step == 0, step if in_space else None)
         self.said.content = sentence(self.screen)
         self.ask_picture()
         self._show_figures(step)

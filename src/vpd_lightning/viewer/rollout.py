@@ -18,11 +18,12 @@ class Rollout:
     """``states[0]`` is the last input frame, as edited; later ones are there as far as ``reach`` was called.
 
     ``number`` is unlike that of every other rollout. ``motion`` is that of what is driven (axis ``step``), which stays
-    where it is afterwards. Methods may be called from any thread.
+    where it is afterwards; ``acts`` says what it does, in words, empty: as recorded. Methods
+    may be called from any thread.
     """
 
-    def __init__(self, simulator: Simulator, editor: SceneEditor, motion: Driven | None = None):
-        self.simulator, self.editor, self.motion = simulator, editor, motion
+    def __init__(self, simulator: Simulator, editor: SceneEditor, motion: Driven | None, acts: str = ""):
+        self.simulator, self.editor, self.motion, self.acts = simulator, editor, motion, acts
         self.states: list[Particles] = [editor.scene.current]
         self.colors: dict[int, UInt8[NDArray, "particle 3"]] = {}
         self.figures: dict[tuple[int, int], dict[str, float]] = {}  # by step and recorded camera
@@ -39,8 +40,8 @@ class Rollout:
 
     @property
     def is_edited(self) -> bool:
-        """Whether anything was edited."""
-        return bool(self.editor.operations)
+        """Whether it differs from the recording: by edits, or by what the tool does."""
+        return bool(self.editor.operations or self.acts)
 
     def _driven_to(self, step: int) -> Driven | None:
         if self.motion is None or step >= len(self.motion.mask):

@@ -17,7 +17,7 @@ from vpd_lightning.errors import EditError
 from vpd_lightning.metrics.chamfer import chamfer
 from vpd_lightning.metrics.psnr import psnr
 from vpd_lightning.metrics.registry import CHAMFER, PSNR
-from vpd_lightning.types import Cameras, Particles
+from vpd_lightning.types import Cameras, Driven, Particles
 from vpd_lightning.viewer.body_names import body_names
 from vpd_lightning.viewer.opened_scene import OpenedScene
 from vpd_lightning.viewer.rollout import Rollout
@@ -39,9 +39,9 @@ class Session:
         self._generation = 0
         self._labels: list[tuple[Operation, str]] = []
 
-    def _fresh(self, editor: SceneEditor) -> Rollout:
+    def _fresh(self, editor: SceneEditor, motion: Driven | None, acts: str) -> Rollout:
         opened = self.opened
-        return Rollout(opened.simulator, editor, opened.rollout.motion) if editor.operations else opened.rollout
+        return Rollout(opened.simulator, editor, motion, acts) if editor.operations or acts else opened.rollout
 
     @property
     def other(self) -> Rollout | None:
@@ -55,9 +55,8 @@ class Session:
         with self.lock:
             done = rollout.editor.operations
             words = [label for operation in done for known, label in self._labels if known is operation]
-        if not done:
-            return "as recorded"
-        return ", ".join(words) if len(words) == len(done) <= 2 else f"{len(done)} edits"
+        edits = words if len(words) == len(done) <= 2 else [f"{len(done)} edits"]
+        return ", ".join([*edits, *([rollout.acts] if rollout.acts else [])]) or "as recorded"
 
     # Selecting
 
@@ -185,8 +184,24 @@ class Session:
     def _edit(self, act: Callable[[SceneEditor], SceneEditor]) -> None:
         with self.lock:
             self._editor = act(self._editor)
-            self.now = self._fresh(self._editor)
+            self.now = self._fresh(self._editor, self.now.motion, self.now.acts)
             self.selector = None
+            self._generation += 1
+
+    # Acting
+
+    @property
+    def tool(self) -> Driven | None:
+        """What is driven, at the last input frame (batch axis of 1); None where the model takes no actions."""
+        with self.lock:
+            return None if self.opened.rollout.motion is None else self.now.editor.scene.current.driven
+
+    def drive(self, motion: Driven | None, acts: str) -> None:
+        """Let the tool move so (axis ``step``), and say what it does; None: as recorded."""
+        with self.lock:
+            if motion is None:
+                motion, acts = self.opened.rollout.motion, ""
+            self.now = self._fresh(self._editor, motion, acts)
             self._generation += 1
 
     # Simulating

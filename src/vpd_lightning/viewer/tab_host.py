@@ -25,6 +25,7 @@ class TabHost(ABC):
     # Handle of viser's slider, whose ``value`` is the step shown, and the tab that says what is shown.
     step: Any
     view_tab: Any
+    edit_tab: Any
 
     @abstractmethod
     def act(self, action: Callable[[], Any]) -> None:
@@ -38,6 +39,10 @@ class TabHost(ABC):
     @abstractmethod
     def notify(self, title: str, text: str, color: Any = "green") -> None:
         """Show a message in the browser."""
+
+    @abstractmethod
+    def select_body(self, cluster: int | None) -> None:
+        """Select a body, or nothing."""
 
     @abstractmethod
     def edit(self, action: Callable[[], Any]) -> None:
