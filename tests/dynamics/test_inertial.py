@@ -25,6 +25,7 @@ SETTINGS = {
     "location_scale": 0.3,
     "force_scale": 0.1,
     "residual_share": 0.1,
+    "acceleration_gain": 1.0,
     "contact_range": 0.5,
     "contact_reach": 5.0,
     "num_contact_iterations": 4,

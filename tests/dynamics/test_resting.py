@@ -88,6 +88,25 @@ def test_a_resting_scene_stays_as_it_is_bit_for_bit_and_a_pushed_one_moves() -> 
     assert moved[0].item() == pytest.approx(0.09, abs=0.01) and moved[1:].abs().max() < 0.01
 
 
+def heavy(**changes):
+    """A model in which everything is pulled down; a cube seen in part would tip."""
+    made = model(**changes)
+    with torch.no_grad():
+        made.forces.acceleration[2] = -0.3
+    return made
+
+
+def test_what_was_seen_to_stand_does_until_it_is_pushed() -> None:
+    scene = cube_on_a_table()
+    still = rolled(heavy(), plate(-0.5, 0.0), 6)
+    assert max((state.positions - scene.positions).abs().max() for state in still) < 1e-12
+    tipped = rolled(heavy(supported_speed=0.0), plate(-0.5, 0.0), 6)[-1]
+    assert (tipped.positions - scene.positions).abs().max() > 0.005
+    pushed = rolled(heavy(), plate(-0.11, 0.03), 12)[-1]
+    down = (pushed.positions - scene.positions)[0, scene.moving[0], 2].mean()
+    assert down < -0.05, "beyond the table's edge it falls"
+
+
 def test_what_is_pushed_goes_as_it_goes_without_skipping() -> None:
     driven = plate(-0.11, 0.02)
     skipped, whole = (rolled(model(skip_resting=skip), driven, 5)[-1].positions for skip in (True, False))

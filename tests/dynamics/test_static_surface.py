@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from vpd_lightning.dynamics.inertial import static_surface as surfaces
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
 from vpd_lightning.dynamics.inertial.contact import ContactPoints
-from vpd_lightning.dynamics.inertial.static_surface import resting_clearances, static_contacts, static_surface
+from vpd_lightning.dynamics.inertial.static_surface import resting_clearances, static_surface, trusted_normals
 
 FAR = 10.0
 
@@ -32,6 +33,13 @@ def surface_of(statics, points, edge_reach=1.5, clearance=0.0):
     return static_surface(statics, points.positions, mask, edge_reach, clearances)
 
 
+def static_contacts(surface, points, statics, far, center=None):
+    """Contacts of one body whose centre is that of its points, but a little higher, unless said otherwise."""
+    middle = points.positions.mean(dim=1, keepdim=True) + torch.tensor([0, 0, 0.05]).double()
+    given = middle if center is None else torch.tensor([[center]], dtype=torch.float64)
+    return surfaces.static_contacts(surface, points, statics, given, far)
+
+
 def test_a_surface_ends_where_it_was_seen_to_end() -> None:
     statics, points = table(), probes((0.2, 0.2, 0.1), (0.53, 0.2, 0.1), (0.7, 0.2, 0.1))
     inside = probes((0.2, 0.2, 0.1))  # footprints of the others would be a surface beyond the edge
@@ -53,7 +61,7 @@ def test_it_goes_on_under_a_body() -> None:
 
 def motion(velocity: tuple[float, float, float]) -> BodyMotion:
     eye, zero = torch.eye(3).double()[None, None], torch.zeros(1, 1, 3).double()
-    return BodyMotion(zero, torch.tensor([[velocity]]).double(), zero, eye, 0 * eye)
+    return BodyMotion(zero + 0.3, torch.tensor([[velocity]]).double(), zero, eye, 0 * eye)
 
 
 @pytest.mark.parametrize(
@@ -74,6 +82,47 @@ def test_what_rests_is_told_from_what_falls(height, velocity, clearance) -> None
     if clearance:
         contacts = static_contacts(surface_of(table(), points, clearance=clearance), points, table(), FAR)
         assert contacts.distances.min().item() == pytest.approx(0, abs=1e-12)
+
+
+def table_with_a_side(slanted: bool = False) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A table's top (x below 0) and its side (x = 0); ``slanted`` are normals along the edge that are of neither."""
+    axis = torch.arange(1, 11, dtype=torch.float64) / 20
+    y = torch.arange(-10, 11, dtype=torch.float64) / 20
+    x, across = (values.flatten() for values in torch.meshgrid(-axis, y, indexing="ij"))
+    z, along = (values.flatten() for values in torch.meshgrid(-axis[:4], y, indexing="ij"))
+    top = torch.stack([x, across, torch.zeros_like(x)], dim=-1)
+    side = torch.stack([torch.zeros_like(z), along, z], dim=-1)
+    edge = torch.stack([torch.zeros_like(y), y, torch.zeros_like(y)], dim=-1)[: len(y) * slanted]
+    normals = [torch.tensor(n).double().expand(len(p), -1) for n, p in (((0, 0, 1.0), top), ((1.0, 0, 0), side))]
+    normals.append(torch.tensor([1.0, 0, 1.0]).double().expand(len(edge), -1) / 2**0.5)
+    positions = torch.cat([top, side, edge])[None]
+    return positions, torch.cat(normals)[None], torch.ones_like(positions[..., 0]) > 0
+
+
+def test_a_side_pushes_what_is_beside_it_and_not_what_stands_on_top() -> None:
+    statics = table_with_a_side()
+    nothing = replace(surface_of(statics, probes((-0.3, 0.0, 0.1))), mask=torch.zeros(1, 1, dtype=torch.bool))
+    low = probes((-0.01, 0.0, -0.03))  # its nearest particle is on the side
+    on_top = static_contacts(nothing, low, statics, FAR, center=(-0.1, 0.0, 0.05))
+    beside = static_contacts(nothing, low, statics, FAR, center=(0.05, 0.0, -0.1))
+    assert on_top.distances.item() == FAR and not on_top.normals.any()
+    assert beside.distances.item() == pytest.approx(-0.01)
+
+
+def test_footprints_near_an_edge_are_on_the_top() -> None:
+    statics = table_with_a_side()
+    body = probes((-0.01, 0.02, 0.005), (-0.02, 0.0, 0.03))
+    found = surface_of(statics, body)
+    assert found.mask.all() and torch.allclose(found.positions[..., 2], torch.zeros(1, 2).double(), atol=1e-12)
+
+
+def test_a_normal_that_its_neighbours_do_not_share_is_not_trusted() -> None:
+    positions, normals, mask = table_with_a_side(slanted=True)
+    kept = trusted_normals(positions, normals, mask).norm(dim=-1)[0] > 0.5
+    is_slanted = normals[0, :, 0] * normals[0, :, 2] != 0
+    assert not kept[is_slanted].any() and kept[normals[0, :, 2] == 1].float().mean() > 0.95
+    alone = trusted_normals(positions[:, :1], normals[:, :1], mask[:, :1])
+    assert not alone.any(), "one particle alone says nothing"
 
 
 def test_without_an_edge_and_without_rest_nothing_is_different() -> None:

@@ -3,9 +3,9 @@
 ``python -m docs.results.studies.contacts OUT.json DATA NAME=CKPT ... [--split test --starts 0 6 12]`` rolls every
 checkpoint out over 32 steps with the true action (a model without actions gets none) and compares, body by body:
 
-- ``onsets``: bodies at rest that are set in motion (by more than ``MOVED``): the share whose predicted motion begins
-  within two frames of the true one, how much later it begins, how many never move; and how many of those that truly
-  stay are moved;
+- ``onsets``: bodies at rest that the pusher or another body sets in motion (by more than ``MOVED``; one that topples by
+  itself is none): the share whose predicted motion begins within two frames of the true one, how much later it begins,
+  how many never move; and how many of those that truly stay are moved;
 - ``penetration`` (mm): the true shapes, carried as the body's particles moved (rigid fit), against each other, the
   pusher and the table by MuJoCo's ``mj_geomDistance``: the deepest place of each frame, mean and 95th percentile;
 - ``drift`` (mm): what bodies that truly stay move within 32 steps;
@@ -46,6 +46,7 @@ AT_REST = 0.001  # metres: what truly stays moves less within the clip
 WITHIN = 2  # frames
 FALLEN = -0.02  # metres: a centre so far below the table's top has left it
 MIN_PARTICLES = 5
+TOUCHING = 0.005  # metres, between what was set in motion and what did it, in one of the frames before
 _FAR = 0.05  # metres: farther apart, MuJoCo need not measure
 
 
@@ -111,13 +112,22 @@ class Shapes:
 
     def depths(self, poses: NDArray[np.float64], pusher: NDArray[np.float64]) -> dict[str, float]:
         """Return how deep (m) bodies at ``poses`` (body, 7) lie in the pusher (its middle, (3,)), table, each other."""
+        self._put(poses, pusher)
+        return {kind: max([0.0] + [-self._gap(pair) for pair in pairs]) for kind, pairs in self.pairs.items()}
+
+    def is_touched(self, body: int, poses: NDArray[np.float64], pusher: NDArray[np.float64]) -> bool:
+        """Return whether the pusher or another body is within ``TOUCHING`` of a body."""
+        self._put(poses, pusher)
+        geom = self.model.geom(f"body{body}").id
+        return any(geom in pair and self._gap(pair) < TOUCHING for pair in self.pairs["pusher"] + self.pairs["bodies"])
+
+    def _put(self, poses: NDArray[np.float64], pusher: NDArray[np.float64]) -> None:
         self.data.qpos[:-2] = poses.reshape(-1)
         self.data.qpos[-2:] = pusher[:2]
         mujoco.mj_kinematics(self.model, self.data)
-        return {
-            kind: max([0.0] + [-mujoco.mj_geomDistance(self.model, self.data, *pair, _FAR, None) for pair in pairs])
-            for kind, pairs in self.pairs.items()
-        }
+
+    def _gap(self, pair: tuple[int, int]) -> float:
+        return float(mujoco.mj_geomDistance(self.model, self.data, *pair, _FAR, None))
 
 
 def carried(start: NDArray[np.float64], points: torch.Tensor) -> NDArray[np.float64]:
@@ -145,13 +155,19 @@ def compare(counts: Counts, clip: Clip, pred: NDArray[np.float64], shown: Sequen
     """Add a clip whose bodies are predicted at ``pred`` (time, body, 7), the observed poses first."""
     true = clip.poses(STEPS).numpy()
     before = clip.previous_pose().numpy()
+    assert clip.driven is not None
+    pusher = clip.driven.positions.double().mean(dim=1).numpy()[-STEPS - 1 :]
     for number in [n for n, is_shown in enumerate(shown) if is_shown]:
         places, ours = true[:, number, :3], pred[:, number, :3]
         if places[0, 2] < FALLEN:
             continue
         stays = np.linalg.norm(places - places[0], axis=-1).max() < AT_REST
         if np.linalg.norm(places[0] - before[number, :3]) < AT_REST / 2:
-            if np.isfinite(onset(places)):
+            begins = onset(places)
+            if np.isfinite(begins):
+                frames = range(max(0, int(begins) - WITHIN), int(begins) + 1)
+                if not any(shapes.is_touched(number, true[frame], pusher[frame]) for frame in frames):
+                    continue
                 counts.late.append(onset(ours) - onset(places))
             elif stays:
                 counts.false_starts.append(bool(np.isfinite(onset(ours))))
@@ -160,11 +176,8 @@ def compare(counts: Counts, clip: Clip, pred: NDArray[np.float64], shown: Sequen
             counts.falls.append(fall(ours) - fall(places))
         else:
             counts.false_falls.append(bool(np.isfinite(fall(ours))))
-    motion = clip.target_driven
-    assert motion is not None
-    pusher = motion.positions.double().mean(dim=1).numpy()
-    for step in range(STEPS):
-        for kind, depth in shapes.depths(pred[step + 1], pusher[step]).items():
+    for step in range(1, STEPS + 1):
+        for kind, depth in shapes.depths(pred[step], pusher[step]).items():
             counts.depth.setdefault(kind, []).append(depth)
 
 

@@ -38,6 +38,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "keep_shape": True,
         "carry_memory": True,
         "extent_weight": 0.0,
+        "acceleration_gain": 1.0,
         "guess_hidden": False,
         "has_driven": False,
         "edge_reach": None,

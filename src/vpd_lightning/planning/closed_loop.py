@@ -101,8 +101,8 @@ def run_with_model(
     """Solve a task by planning with a trained simulator from what the cameras see.
 
     The task names its bodies by where they are at first (a person would click on them); from then on each is the
-    cluster of particles nearest to where it was predicted to be. Where the task seems solved, nothing is planned and the
-    tool stays until the next look. ``progress`` is called with the number of each
+    cluster of particles nearest to where it was predicted to be. Where the task seems solved, nothing is planned and
+    the tool stays until the next look. ``progress`` is called with the number of each
     decision, how many there are and the cost of its plan.
     """
     episode, start = Episode(num_steps=loop.num_executed * loop.tool.hold), None

@@ -1,7 +1,6 @@
 """The learned part of the inertial dynamics: forces on bodies from contact, weight and one another."""
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,12 +9,6 @@ from torch import Tensor, nn
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia
 from vpd_lightning.dynamics.inertial.contact import Contacts
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rotate
-
-_GAIN = 30.0
-"""On the weights of the common acceleration: an update changes three numbers by less than it does a network of many.
-
-Without, 500 updates of Adam moved them by a thousandth where falls are rare: nothing fell off a table.
-"""
 
 
 class BodyForces(nn.Module):
@@ -27,7 +20,8 @@ class BodyForces(nn.Module):
     moves and turns the whole body (Newton-Euler). One more force acts at the centre, without torque, as weight does,
     and one acceleration is the same for all bodies, always: what it is, and where it points, is learned. Forces are at
     most ``residual_share`` of ``force_scale`` (metres per step squared), which bounds the common acceleration:
-    until that is learned, the other forces must not replace it.
+    until that is learned, the other forces must not replace it. ``acceleration_gain`` multiplies the learning rate of
+    the common acceleration: an update changes three numbers by less than it does the output of a network.
     Damping scales the carried velocity: impacts and friction remove motion
     in proportion to it. Zero-initialised: no force, hardly any damping (0.7 % a step).
     """
@@ -41,13 +35,15 @@ class BodyForces(nn.Module):
         location_scale: float,
         force_scale: float,
         residual_share: float,
+        acceleration_gain: float,
         contact_range: float,
     ):
         super().__init__()
         self.num_forces, self.contact_range = num_forces, contact_range
         self.location_scale, self.force_scale = location_scale, force_scale
         self.residual_scale = residual_share * force_scale
-        self.common_acceleration = nn.Parameter(torch.zeros(3))
+        self.acceleration_gain = acceleration_gain
+        self.acceleration = nn.Parameter(torch.zeros(3))
         self.encode_probe = _mlp(19, hidden_dim, hidden_dim)
         self.encode_body = _mlp(2 * hidden_dim + 7, hidden_dim, hidden_dim)
         self.messages = nn.ModuleList(
@@ -65,17 +61,9 @@ class BodyForces(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
-    @property
-    def acceleration(self) -> Float[Tensor, " 3"]:
-        """What all bodies have in common, metres per step squared."""
-        return self.force_scale * torch.tanh(_GAIN * self.common_acceleration)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
-        """Take the weights of versions up to 0.1.0 too, which had no gain."""
-        old = state_dict.pop(f"{prefix}acceleration", None)
-        if old is not None:
-            state_dict[f"{prefix}common_acceleration"] = old / _GAIN
-        super()._load_from_state_dict(state_dict, prefix, *args)
+    def common_acceleration(self) -> Float[Tensor, " 3"]:
+        """Return what is the same for all bodies, metres per step squared."""
+        return self.force_scale * torch.tanh(self.acceleration_gain * self.acceleration)
 
     def forward(
         self,
@@ -168,7 +156,7 @@ class BodyForces(nn.Module):
         forces = attention[..., None] * forces
         push = forces.sum(dim=(2, 3))
         torque = cross(offsets, forces.sum(dim=3)).sum(dim=2)
-        weight = self.residual_scale * torch.tanh(self.weight(body)) + self.acceleration
+        weight = self.residual_scale * torch.tanh(self.weight(body)) + self.common_acceleration()
         # Nearly one at initialisation; it may remove motion, never add any: a long rollout cannot feed on itself.
         keep = torch.sigmoid(self.damping(body) + 5.0)
         weight, torque = weight * there[..., None], torque * there[..., None]

@@ -12,13 +12,8 @@ from torch import Tensor, nn
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.inertial.body_forces import BodyForces
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, body_volumes, matrices_of, vectors_of
-from vpd_lightning.dynamics.inertial.contact import (
-    Resolved,
-)
-from vpd_lightning.dynamics.inertial.contact_points import (
-    contact_points,
-    pushed_surface,
-)
+from vpd_lightning.dynamics.inertial.contact import Resolved
+from vpd_lightning.dynamics.inertial.contact_points import contact_points, pushed_surface
 from vpd_lightning.dynamics.inertial.contact_step import resolved_contacts
 from vpd_lightning.dynamics.inertial.driven_bodies import (
     DrivenBodies,
@@ -38,14 +33,11 @@ from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity
 from vpd_lightning.dynamics.inertial.hidden_side import HiddenGuess, hidden_after
 from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
-from vpd_lightning.dynamics.inertial.resting import is_slow, members_in_use, rested, rows_of, with_rows
+from vpd_lightning.dynamics.inertial.resting import held, is_slow, members_in_use, rested, rows_of, with_rows
 from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, rotate, rotation_from_spin
 from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
 from vpd_lightning.dynamics.inertial.standing import may_be_hidden, standing
-from vpd_lightning.dynamics.inertial.static_surface import (
-    static_contacts,
-    static_surface,
-)
+from vpd_lightning.dynamics.inertial.static_surface import static_contacts, static_surface, trusted_normals
 from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Particles
@@ -80,7 +72,7 @@ class InertialDynamics(AbstractDynamics):
     With ``edge_reach`` (spacings of the static particles) a static surface ends that far beside its last particle, and
     goes on under bodies; null: it goes on without end. A body that approaches the surface under it by less than
     ``supported_speed`` (in ``force_scale``, per step) when it is first seen stands on it, whatever of its foot was seen
-    (``static_surface``).
+    (``static_surface``), and one that stands still does until something pushes it (``resting.held``).
 
     With ``skip_resting``, and without gradients, a member of the batch in which all bodies rest (in contact, slower
     than ``rest_share``) and nothing driven is about to push one stays as it is.
@@ -110,6 +102,7 @@ class InertialDynamics(AbstractDynamics):
         location_scale: float,
         force_scale: float,
         residual_share: float,
+        acceleration_gain: float,
         contact_range: float,
         contact_reach: float,
         num_contact_iterations: int,
@@ -134,6 +127,8 @@ class InertialDynamics(AbstractDynamics):
         for name, scale in (("body_link", body_link), ("location_scale", location_scale), ("force_scale", force_scale)):
             if scale <= 0:
                 raise ValueError(f"{name} must be positive, got {scale}")
+        if acceleration_gain <= 0:
+            raise ValueError(f"acceleration_gain must be positive, got {acceleration_gain}")
         if min(rest_share, residual_share, extent_weight) < 0:
             raise ValueError(
                 "rest_share, residual_share and extent_weight must not be negative, "
@@ -154,6 +149,7 @@ class InertialDynamics(AbstractDynamics):
             location_scale=location_scale,
             force_scale=force_scale,
             residual_share=residual_share,
+            acceleration_gain=acceleration_gain,
             contact_range=contact_range,
         )
         self.materials = MaterialNetwork(feature_dim=feature_dim, hidden_dim=hidden_dim, is_soft=is_soft)
@@ -199,8 +195,11 @@ class InertialDynamics(AbstractDynamics):
             centers = equidistant_centers(seen.positions, seen.normals, shares, self.extent_weight)
             static_index, static_mask = gather_index(current.mask & ~movable(current))
             static_positions = take(current.positions, static_index)
+            static_normals = take(current.normals, static_index)  # type: ignore[arg-type]
+            if self.edge_reach is not None:
+                static_normals = trusted_normals(static_positions, static_normals, static_mask)
             mirrored = mask & may_be_hidden(
-                (static_positions, take(current.normals, static_index), static_mask),  # type: ignore[arg-type]
+                (static_positions, static_normals, static_mask),
                 seen.positions, bodies, centers, self.contact_reach,
             )  # fmt: skip
             spacing = point_spacing(seen.positions, mask)
@@ -227,6 +226,7 @@ class InertialDynamics(AbstractDynamics):
             first_shade=self.moving_shading(seen.features, seen.normals),
             static_index=static_index,
             static_mask=static_mask,
+            static_normals=static_normals,
             static_features=static_features,
             static_shade=(
                 torch.zeros_like(static_features)
@@ -234,14 +234,14 @@ class InertialDynamics(AbstractDynamics):
                 else self.static_shading(static_features, static_positions, seen.positions, mask)
             ),
             hidden=hidden,
+            undisturbed=torch.zeros_like(empty, dtype=torch.bool),
             surface=static_surface((seen.positions, seen.normals, mask), seen.positions, mask, None, empty),
             at_rest=~members_in_use(bodies),
         )
-        statics = (static_positions, take(current.normals, static_index), static_mask)  # type: ignore[arg-type]
         return standing(
             memory,
             seen.positions,
-            statics,
+            (static_positions, static_normals, static_mask),
             current.driven if self.has_driven else None,
             num_probes=self.num_probes,
             is_mirrored=self.mirror_hidden,
@@ -303,7 +303,7 @@ class InertialDynamics(AbstractDynamics):
         driven = None
         if self.has_driven and current.driven is not None and current.driven.mask.any():
             driven = driven_bodies(current.driven, memory.origin)
-        resolved = self._resolved(positions, static_positions, current.normals, memory, driven)  # type: ignore[arg-type]
+        resolved = self._resolved(positions, static_positions, memory, driven)
         step, onward = rested(resolved, self.rest_share * self.force_scale, _ARM * self.contact_range)
         own = memory.own
         moved = step.carried(positions, own)
@@ -323,8 +323,11 @@ class InertialDynamics(AbstractDynamics):
         if hidden is not None:
             places = (following, onward.centers, rotations)
             hidden, side = hidden_after(hidden, *places, self.moving_shading, memory.origin)
-        at_rest = resolved.touching.squeeze(-1) & self._is_slow(onward) | ~members_in_use(memory.bodies)
-        memory = replace(memory, motion=onward, normals=turned, velocities=velocities, hidden=hidden, at_rest=at_rest)
+        is_slow_now = self._is_slow(onward)
+        undisturbed = memory.undisturbed & is_slow_now
+        at_rest = resolved.touching.squeeze(-1) & is_slow_now | undisturbed | ~members_in_use(memory.bodies)
+        memory = replace(memory, motion=onward, normals=turned, velocities=velocities, hidden=hidden)
+        memory = replace(memory, undisturbed=undisturbed, at_rest=at_rest)
         # Normals rotate with their bodies: a memory rebuilt from these particles needs those of the new pose.
         normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
         return replace(current, positions=all_positions, features=features, normals=normals, hidden_side=side), memory
@@ -333,7 +336,6 @@ class InertialDynamics(AbstractDynamics):
         self,
         positions: Tensor,
         static_positions: Tensor,
-        normals: Tensor,
         memory: InertialMemory,
         driven: DrivenBodies | None,
     ) -> Resolved:
@@ -348,9 +350,9 @@ class InertialDynamics(AbstractDynamics):
         own = memory.own[:, probes]
         offsets = probe_positions - vectors_of(memory.motion.centers, own)
         moved = vectors_of(memory.motion.displacements, own) + memory.motion.turned(offsets, own) - offsets
-        statics = (static_positions, take(normals, memory.static_index), memory.static_mask)
+        statics = (static_positions, memory.static_normals, memory.static_mask)
         points = contact_points(probe_positions, memory, members, self.mirror_hidden)
-        contacts = static_contacts(memory.surface, points, statics, self.contact_reach)
+        contacts = static_contacts(memory.surface, points, statics, memory.motion.centers, self.contact_reach)
         motion = self.forces(
             probe_positions,
             moved * memory.mask[:, probes, None],
@@ -360,7 +362,7 @@ class InertialDynamics(AbstractDynamics):
             memory.motion,
             inertia,
         )
-        motion = replace(motion, strains=_elastic(motion, materials))
+        motion = held(replace(motion, strains=_elastic(motion, materials)), memory.undisturbed)
         return resolved_contacts(
             motion,
             inertia,

@@ -30,9 +30,11 @@ class InertialMemory:
     first_features: Float[Tensor, "batch moving feature"]
     first_shade: Float[Tensor, "batch moving feature"]
     static_index: Int[Tensor, "batch static"]
+    static_normals: Float[Tensor, "batch static 3"]  # zero where they are not trusted
     static_mask: Bool[Tensor, "batch static"]
     static_features: Float[Tensor, "batch static feature"]
     static_shade: Float[Tensor, "batch static feature"]  # with the moving ones where they were at first
     hidden: HiddenParticles | None
     surface: StaticSurface
+    undisturbed: Bool[Tensor, "batch body"]  # it was seen to stand still, and nothing has pushed it since
     at_rest: Bool[Tensor, "batch body"]  # it stands or lies and hardly moves; a place without a body does, too

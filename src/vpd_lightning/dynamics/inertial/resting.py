@@ -20,6 +20,21 @@ def is_slow(motion: BodyMotion, speed: float, arm: float) -> Bool[Tensor, "batch
     return square < speed**2
 
 
+def held(motion: BodyMotion, undisturbed: Bool[Tensor, "batch body"]) -> BodyMotion:
+    """Return the motion with none of bodies that are still undisturbed: what was seen to stand is in balance.
+
+    That is known better than where its weight acts and on what: both are guesses about its hidden side, and with them
+    most bodies would tip.
+    """
+    moves = ~undisturbed[..., None]
+    return replace(
+        motion,
+        displacements=motion.displacements * moves,
+        spins=motion.spins * moves,
+        strains=motion.strains * moves[..., None],
+    )
+
+
 def rested(resolved: Resolved, slowest: float, arm: float) -> tuple[BodyMotion, BodyMotion]:
     """Stop bodies in contact that move by less than ``slowest`` in a step (metres; a rotation counts at ``arm``).
 

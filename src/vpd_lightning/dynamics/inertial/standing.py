@@ -44,10 +44,12 @@ def standing(
         points = contact_points(probes, replace(memory, mirrored=memory.mask), members, is_mirrored)
         sizes = body_sizes(memory)
         clearances, rests = resting_clearances(points, statics, memory.motion, sizes, supported_speed, far)
+        undisturbed = rests & is_slow(memory.motion, rest_speed, arm)
         memory = replace(
             memory,
             mirrored=memory.mask & (memory.mirrored | torch.gather(rests, 1, memory.own)),
-            at_rest=memory.at_rest | rests & is_slow(memory.motion, rest_speed, arm),
+            undisturbed=undisturbed,
+            at_rest=memory.at_rest | undisturbed,
         )
     return replace(memory, surface=static_surface(statics, above, is_above, edge_reach, clearances))
 

@@ -3,13 +3,18 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, vectors_of
 from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, nearest_static_contacts
-from vpd_lightning.dynamics.inertial.nearest import nearest_usable
 from vpd_lightning.geometry.spacing import point_spacing
+
+_BEHIND = 0.005
+"""Metres by which a seen point may be behind a tangent plane that it is above: noise of the plane."""
+
+_NUM_NEIGHBOURS, _NUM_AGREEING, _AGREEMENT = 8, 4, 0.9
+"""A normal is trusted that so many of the nearest particles share, to this cosine."""
 
 _MOST_CLEARANCE = 0.75
 """Of a body's size: what seems to end farther above its surface, or below it, does not rest on that one."""
@@ -32,6 +37,26 @@ class StaticSurface:
 
 
 @torch.no_grad()
+def trusted_normals(
+    positions: Float[Tensor, "batch point 3"],
+    normals: Float[Tensor, "batch point 3"],
+    mask: Bool[Tensor, "batch point"],
+) -> Float[Tensor, "batch point 3"]:
+    """Return the normals, zero where too few of the nearest particles share them.
+
+    At an edge a normal is that of neither side, and its tangent plane cuts into what stands on the surface beside it.
+    """
+    oriented = mask & (normals.square().sum(dim=-1) > 0.5)
+    square = (positions[:, :, None] - positions[:, None]).square().sum(dim=-1)
+    square = square.masked_fill(~(oriented[:, :, None] & oriented[:, None]), torch.inf)
+    square.diagonal(dim1=1, dim2=2).fill_(torch.inf)
+    near = square.topk(min(_NUM_NEIGHBOURS, square.shape[-1]), dim=-1, largest=False)
+    cosines = torch.einsum("bpi,bqi->bpq", normals, normals).gather(2, near.indices)
+    agreeing = ((cosines > _AGREEMENT) & torch.isfinite(near.values)).sum(dim=-1)
+    return normals * (agreeing >= _NUM_AGREEING)[..., None]
+
+
+@torch.no_grad()
 def static_surface(
     statics: tuple[Tensor, Tensor, Tensor],
     above: Float[Tensor, "batch point 3"],
@@ -42,15 +67,16 @@ def static_surface(
     """Return what contact needs beside the static particles (positions, normals, mask).
 
     ``above`` are points of what hides the surface below it: bodies, and what is driven. Each is projected on the
-    tangent plane of the static particle nearest to it. ``edge_reach`` is in spacings of the static particles; null: a
-    surface goes on without end, and there are no footprints.
+    tangent plane of the static particle nearest to it, of those whose plane it is not behind: what is seen is outside
+    of everything, and near a table's edge the nearest particle may be on the table's side. ``edge_reach`` is in
+    spacings of the static particles; null: a surface goes on without end, and there are no footprints.
     """
     positions, normals, mask = statics
     if edge_reach is None:
         nothing = above[:, :0], above[:, :0], is_above[:, :0]
         return StaticSurface(*nothing, torch.full_like(above[:, 0, 0], torch.inf), clearances)
     oriented = mask & (normals.square().sum(dim=-1) > 0.5)
-    index, exists = nearest_usable(above, positions, oriented)
+    index, exists = _nearest_below(above, positions, normals, oriented)
     facing = vectors_of(normals, index)
     heights = ((above - vectors_of(positions, index)) * facing).sum(dim=-1, keepdim=True)
     known = exists & is_above
@@ -63,17 +89,33 @@ def static_surface(
     )
 
 
+def _nearest_below(
+    above: Tensor, positions: Tensor, normals: Tensor, usable: Tensor
+) -> tuple[Int[Tensor, "batch point"], Bool[Tensor, "batch point"]]:
+    """Return the nearest static particle whose tangent plane each point is not behind, and whether there is one."""
+    square = (above[:, :, None] - positions[:, None]).square().sum(dim=-1)
+    heights = torch.einsum("bpi,bsi->bps", above, normals) - (positions * normals).sum(dim=-1)[:, None]
+    counts = usable[:, None] & (heights > -_BEHIND)
+    least, index = square.masked_fill(~counts, torch.inf).min(dim=-1)
+    return index, torch.isfinite(least)
+
+
 def static_contacts(
     surface: StaticSurface,
     points: ContactPoints,
     statics: tuple[Tensor, Tensor, Tensor],
+    centers: Float[Tensor, "batch body 3"],
     far: float,
 ) -> Contacts:
-    """Measure contact points against the static particles and footprints; resting bodies from where they rest."""
+    """Measure contact points against the static particles and footprints; resting bodies from where they rest.
+
+    A surface that ends acts on bodies whose centre is in front of it: the side of a table not on what stands on top.
+    """
     parts = zip(statics, (surface.positions, surface.normals, surface.mask), strict=True)
     joined = [torch.cat(part, dim=1) for part in parts] if surface.mask.shape[1] else list(statics)
     found = nearest_static_contacts(points.positions, joined[0], joined[1], joined[2], far)
     is_on = found.lateral < surface.reach[:, None]
+    is_on = is_on & (_in_front(found, points, centers) | torch.isinf(surface.reach)[:, None])
     lowered = found.distances - torch.gather(surface.clearances, 1, points.bodies)
     # Without a surface near, the distance is the farthest there is.
     known = found.normals.square().sum(dim=-1) > 0.5
@@ -82,6 +124,14 @@ def static_contacts(
         normals=found.normals * is_on[..., None],
         lateral=torch.where(is_on, found.lateral, torch.full_like(found.lateral, far)),
     )
+
+
+def _in_front(
+    found: Contacts, points: ContactPoints, centers: Float[Tensor, "batch body 3"]
+) -> Bool[Tensor, "batch point"]:
+    """Return whether the centre of each point's body is in front of the plane that the point meets."""
+    inward = vectors_of(centers, points.bodies) - points.positions
+    return found.distances + (inward * found.normals).sum(dim=-1) > 0
 
 
 @torch.no_grad()
@@ -100,7 +150,8 @@ def resting_clearances(
     and is near is supported: there it ends. Zero for all others.
     """
     found = nearest_static_contacts(points.positions, *statics, far)
-    belongs = (points.members > 0) & (found.normals.square().sum(dim=-1) > 0.5)[:, None]
+    known = (found.normals.square().sum(dim=-1) > 0.5) & _in_front(found, points, motion.centers)
+    belongs = (points.members > 0) & known[:, None]
     gaps, lowest = found.distances[:, None].masked_fill(~belongs, torch.inf).min(dim=-1)
     normals = vectors_of(found.normals, lowest)
     approach = (motion.displacements * normals).sum(dim=-1).abs()
