@@ -147,8 +147,8 @@ def test_what_is_dragged_is_a_stop_where_it_is_let_go(panel: Panel) -> None:
     drag = gizmo._impl_aux.update_cb[-1]
     for phase in ("start", "update", "end"):
         asyncio.run(drag(SimpleNamespace(target=SimpleNamespace(position=place), phase=phase)))
-    wait_until(lambda: len(tab.stops) == 1)
-    assert tab.stops[0] == pytest.approx(place[:2])
+    wait_until(lambda: "Drag on for the next stop" in tab.status.content)
+    assert len(tab.stops) == 1 and tab.stops[0] == pytest.approx(place[:2])
 
 
 def test_a_plan_is_played_and_says_what_is_expected(panel: Panel) -> None:

@@ -80,7 +80,7 @@ def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) 
                 trajectory += [number] * int(keep.sum())
     found = _summary({name: np.concatenate(values) for name, values in rows.items()}, np.array(trajectory))
     parameters = sum(values.numel() for values in model.simulator.parameters())
-    return {**found, "updates": model.step, "parameters": parameters}
+    return {**found, "updates": model.step, "parameters": parameters, "starts": list(starts)}
 
 
 def _summary(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]) -> dict[str, Any]:

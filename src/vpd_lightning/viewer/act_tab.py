@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vpd_lightning.editing.scene_editor import SceneEditor
+from vpd_lightning.editing.operations import Operation
 from vpd_lightning.errors import ActionError
 from vpd_lightning.planning.costs import NearTool, Sum, TargetPlace
 from vpd_lightning.planning.plan import plan
@@ -34,7 +34,7 @@ class _Aim:
     """The particles that should get to the goal, of a scene that was edited so."""
 
     chosen: Bool[Tensor, " particle"]
-    editor: SceneEditor
+    operations: tuple[Operation, ...]
 
 
 class ActTab:
@@ -138,7 +138,7 @@ class ActTab:
     def _show_goal(self) -> None:
         self.session.need_selection()
         chosen, name = self.session.selected, self.panel.edit_tab.name
-        self._aim = _Aim(chosen, self.session.now.editor)
+        self._aim = _Aim(chosen, tuple(self.session.operations()))
         middle = self.session.now.states[0].positions[0][chosen].double().mean(dim=0).cpu().numpy()
         self.panel.select_body(None)  # else the arrows of the goal and those of the body would lie over each other
         self._show_in_space()
@@ -155,7 +155,7 @@ class ActTab:
             ActionError: the scene has no goal, or a plan is being looked for already.
         """
         aim, goal = self._aim, self.handles.goal
-        if aim is None or goal is None or aim.editor is not self.session.now.editor:
+        if aim is None or goal is None or aim.operations != tuple(self.session.operations()):
             raise ActionError("There is no goal in this scene.\nClick a body, press Drag a goal, and put it there.")
         if not self._planning.acquire(blocking=False):
             raise ActionError("A plan is being looked for already.\nWait until it is found.")
