@@ -49,6 +49,8 @@ def resolved_contacts(
         count = driven.members.shape[1]
         motion, inertia = joined_motion(motion, driven.motion), joined_inertia(inertia, count)
         materials = joined_materials(materials, driven_friction, count)
+        # Ratios alone matter, and the square of a small body's volume is no float32.
+        masses = masses / masses.detach().amax(dim=1, keepdim=True)
         masses = torch.cat([masses, torch.full_like(masses[:, :1], torch.inf).expand(-1, count, -1)], dim=1)
     solver = ContactSolver(
         points=points,
