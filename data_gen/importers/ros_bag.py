@@ -37,6 +37,7 @@ from data_gen.importers.ros_images import colour_image, depth_image
 from data_gen.importers.ros_mapping import CameraTopics, RosMapping, read_ros_mapping
 from data_gen.importers.ros_transforms import TransformTree, frame_name
 from data_gen.importers.settings import ImportSettings, chosen
+from vpd_lightning.data.driven_motion import DrivenMotion
 from vpd_lightning.errors import DataError
 
 FORMAT = "ros"
@@ -105,6 +106,9 @@ def _bag_recordings(bag: Bag, mapping: RosMapping, settings: ImportSettings) -> 
     is_imaged = np.all([index >= 0 for index in (*colour, *depth)], axis=0)
     tracked = [_poses(bag, camera, mapping, contents.tree, settings) for camera in cameras]
     is_posed = np.all([known[index] for index, (_, known) in zip(colour, tracked, strict=True)], axis=0)
+    links = _robot(bag, cameras[0], mapping, contents.tree, settings)
+    if links is not None:
+        is_posed &= links[1]
     frames = np.flatnonzero(is_imaged & is_posed)
     frame_time = usual_step(times)
     stretches = runs_without_gap(times[frames], frame_time) if len(frames) else []
@@ -125,6 +129,7 @@ def _bag_recordings(bag: Bag, mapping: RosMapping, settings: ImportSettings) -> 
             np.stack([poses[index[kept]] for index, (poses, _) in zip(colour, tracked, strict=True)], axis=1),
             settings.frame_time or frame_time,
             settings,
+            None if links is None or mapping.robot is None else mapping.robot.motion(links[0][kept]),
         )
 
 
@@ -226,6 +231,17 @@ def _poses(
     return (opengl_to_opencv(poses) if settings.axes == "opengl" else poses), known
 
 
+def _robot(
+    bag: Bag, first: _Camera, mapping: RosMapping, tree: TransformTree, settings: ImportSettings
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
+    """Return poses (time, link, 4, 4) of the robot's links at the times of the first camera; None without a robot."""
+    if mapping.robot is None:
+        return None
+    gap, where = pose_gap(settings.max_time_difference), str(bag.path)
+    world = mapping.world_frame or tree.root(first.topics.frame or first.image.frame)
+    return mapping.robot.poses(tree, world, first.times, gap, where)
+
+
 def _recording(
     bag: Bag,
     name: str,
@@ -235,6 +251,7 @@ def _recording(
     poses: NDArray[np.float64],
     frame_time: float,
     settings: ImportSettings,
+    driven: DrivenMotion | None,
 ) -> Recording:
     first = cameras[0].image
     for camera in cameras[1:]:
@@ -291,6 +308,7 @@ def _recording(
         depth_cameras=[camera.sensor for camera in cameras],
         view_names=[camera.topics.name or camera.topics.rgb for camera in cameras],
         distortion=np.stack(distortions) if size else None,
+        driven=driven,
     )
 
 

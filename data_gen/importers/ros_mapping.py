@@ -12,6 +12,10 @@ YAML; only ``cameras`` with ``rgb`` and ``depth`` must be there::
         cam_to_world: [[1, 0, 0, 0.5], ...]   # 4x4, instead of tf; x right, y down, z forward
         depth_scale: 0.001                    # metres per step of 16-bit depth
         is_aligned: true                      # depth does fit colour, although frame_id or calibration differ
+    robot:                                    # what its links did, by tf
+      model: arm.urdf                         # URDF or MJCF with their shapes, beside the mapping
+      frames: {world: base_link}              # tf frame of links that tf calls otherwise than the model
+      points: 256                             # on all links together
 """
 
 from dataclasses import dataclass
@@ -23,10 +27,11 @@ import yaml
 from numpy.typing import NDArray
 
 from data_gen.importers.conventions import checked_pose
+from data_gen.importers.ros_robot import TrackedRobot, read_ros_robot
 from data_gen.settings import did_you_mean
 from vpd_lightning.errors import ConfigError, one_line
 
-_TOP_KEYS = ("world_frame", "cameras")
+_TOP_KEYS = ("world_frame", "cameras", "robot")
 _CAMERA_KEYS = ("name", "rgb", "depth", "info", "frame", "cam_to_world", "depth_scale", "is_aligned")
 
 
@@ -50,6 +55,7 @@ class RosMapping:
 
     cameras: tuple[CameraTopics, ...] = ()
     world_frame: str | None = None
+    robot: TrackedRobot | None = None
 
 
 def read_ros_mapping(path: Path) -> RosMapping:
@@ -70,7 +76,8 @@ def read_ros_mapping(path: Path) -> RosMapping:
     world_frame = values.get("world_frame")
     if world_frame is not None and not isinstance(world_frame, str):
         raise ConfigError(f"{path}: world_frame is {world_frame!r}; the name of a frame was expected.")
-    return RosMapping(cameras, world_frame)
+    robot = read_ros_robot(values["robot"], path) if "robot" in values else None
+    return RosMapping(cameras, world_frame, robot)
 
 
 def _camera(entry: Any, number: int, path: Path) -> CameraTopics:
