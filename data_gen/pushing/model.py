@@ -6,16 +6,16 @@ import numpy as np
 
 from data_gen.cameras import camera_xml, mjcf_numbers
 from data_gen.labels import Labels
+from data_gen.pushing.arm import PUSHER, controls_xml, tool_xml
 from data_gen.pushing.bodies import PlacedBody
 from data_gen.pushing.settings import PushingSettings
 from vpd_lightning.data.schema import DRIVEN_LABEL
 
-PUSHER = "pusher"
 _ROLLING = "0.005 0.0005"  # torsional and rolling friction, m: balls come to rest on the table
 
 
 def compile_model(settings: PushingSettings, bodies: list[PlacedBody]) -> Any:
-    """Return the compiled model: body i + 1 is object i, its free joint joint i; then the pusher with x and y."""
+    """Return the compiled model: body i + 1 is object i, its free joint joint i; then the pusher's two joints."""
     import mujoco
 
     return mujoco.MjModel.from_xml_string(_scene_xml(settings, bodies))
@@ -46,6 +46,7 @@ def _scene_xml(settings: PushingSettings, bodies: list[PlacedBody]) -> str:
     <texture name="sky" type="skybox" builtin="flat" width="8" height="48" rgb1="0.86 0.89 0.92" rgb2="0.86 0.89 0.92"/>
     <material name="table" rgba="{mjcf_numbers(table.color)} 1" specular="0" shininess="0"/>
     <material name="floor" rgba="{mjcf_numbers(table.floor_color)} 1" specular="0" shininess="0"/>
+    <material name="arm" rgba="{mjcf_numbers(settings.arm.color)} 1" specular="0" shininess="0"/>
     <material name="{PUSHER}" rgba="{mjcf_numbers(pusher.color)} 1" specular="0" shininess="0"/>
     {"".join(_material(number, body) for number, body in enumerate(bodies))}
   </asset>
@@ -59,16 +60,11 @@ def _scene_xml(settings: PushingSettings, bodies: list[PlacedBody]) -> str:
     <geom name="foot" type="box" pos="0 0 {-(table.height + table.thickness) / 2!r}" size="{mjcf_numbers(foot)}"
       material="table" friction="{friction}"/>
     {"".join(_body(number, body) for number, body in enumerate(bodies))}
-    <body name="{PUSHER}" pos="0 0 {settings.pusher_height!r}" gravcomp="1">
-      <joint name="x" type="slide" axis="1 0 0"/>
-      <joint name="y" type="slide" axis="0 1 0"/>
-      <geom name="{PUSHER}" type="cylinder" size="{pusher.radius!r} {pusher.length / 2!r}" mass="{pusher.mass!r}"
-        material="{PUSHER}" friction="{pusher.friction!r} {_ROLLING}"/>
-    </body>
+    {tool_xml(settings)}
     {camera_xml(settings.camera)}
   </worldbody>
   <actuator>
-    {"".join(_control(settings, axis) for axis in "xy")}
+    {controls_xml(settings)}
   </actuator>
 </mujoco>"""
 
@@ -90,12 +86,4 @@ def _body(number: int, body: PlacedBody) -> str:
         f'<body name="body{number}"><freejoint/><geom name="body{number}" type="{body.shape}" {turn}'
         f' size="{mjcf_numbers(body.mjcf_size)}" mass="{body.mass!r}" material="body{number}" condim="6"'
         f' friction="{body.friction!r} {_ROLLING}"/></body>'
-    )
-
-
-def _control(settings: PushingSettings, axis: str) -> str:
-    pusher = settings.pusher
-    return (
-        f'<position name="{axis}" joint="{axis}" kp="{pusher.stiffness!r}" kv="{pusher.damping!r}"'
-        f' forcerange="{-pusher.max_force!r} {pusher.max_force!r}"/>'
     )

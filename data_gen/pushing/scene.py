@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from data_gen.pushing.arm import joints_of, link_poses, link_surfaces, place_of
 from data_gen.pushing.bodies import PlacedBody, draw_bodies
-from data_gen.pushing.model import PUSHER, compile_model, labels_of
+from data_gen.pushing.model import compile_model, labels_of
 from data_gen.pushing.motion import CommandedPath, draw_path
-from data_gen.pushing.settings import PusherSettings, PushingSettings
+from data_gen.pushing.settings import PushingSettings
 from data_gen.renderers import open_renderer
 from data_gen.rigid_bodies import RigidBodies
 from data_gen.settings import SPLIT_CODES
@@ -19,8 +20,6 @@ from data_gen.simulate_and_render import simulate_and_render, trajectory_of
 from data_gen.stage_clock import StageClock
 from vpd_lightning.data import schema
 from vpd_lightning.data.driven_motion import DrivenMotion
-
-_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
 class PushingScene:
@@ -97,10 +96,10 @@ class Pushing:
         for number, body in enumerate(bodies):
             turn = Rotation.from_euler("z", body.yaw).as_quat(scalar_first=True)
             self.data.qpos[7 * number : 7 * number + 7] = [*body.place, body.half_sizes[2], *turn]
-        self.data.qpos[-2:] = path.at(0.0)
-        self.data.ctrl[:] = path.at(0.0)
-        self._index = self.model.body(PUSHER).id
-        self._measured, self._commanded = (np.tile(np.eye(4), (settings.num_frames, 1, 1, 1)) for _ in range(2))
+        self.data.qpos[-2:] = self.data.ctrl[:] = joints_of(settings, path.at(0.0))
+        self._surfaces = link_surfaces(settings)
+        shape = (settings.num_frames, int(self._surfaces[2].max()) + 1, 4, 4)
+        self._measured, self._commanded = np.zeros(shape), np.zeros(shape)
 
     def begin_frame(self, frame: int) -> None:
         """Note the motion that goes with a picture; where pictures are late, that of a moment afterwards."""
@@ -130,7 +129,7 @@ class Pushing:
     def _advance(self) -> None:
         import mujoco
 
-        self.data.ctrl[:] = self.path.at(self.data.time + self.settings.timestep)
+        self.data.ctrl[:] = joints_of(self.settings, self.path.at(self.data.time + self.settings.timestep))
         mujoco.mj_step(self.model, self.data)
 
     def _later(self, frame: int) -> None:
@@ -145,31 +144,14 @@ class Pushing:
         mujoco.mj_copyData(self.data, self.model, kept)
 
     def _note(self, frame: int) -> None:
-        self._measured[frame, 0, :2, 3] = self.data.qpos[-2:]
-        self._commanded[frame, 0, :2, 3] = self.path.at(self.data.time)
-        for poses in (self._measured, self._commanded):
-            poses[frame, 0, 2, 3] = self.settings.pusher_height
+        self._measured[frame] = link_poses(self.settings, self.data.qpos[-2:])
+        self._commanded[frame] = link_poses(self.settings, joints_of(self.settings, self.path.at(self.data.time)))
 
     def driven_motion(self) -> DrivenMotion:
-        """Return points on the pusher's surface as it moved."""
-        points, normals = cylinder_surface(self.settings.pusher)
-        groups = np.zeros(len(points), np.int32)
-        return DrivenMotion.carried(points, normals, groups, self._measured, self._commanded)
+        """Return points on the surface of pusher and arm as they moved."""
+        return DrivenMotion.carried(*self._surfaces, self._measured, self._commanded)
 
-
-def cylinder_surface(pusher: PusherSettings) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Spread points evenly over an upright cylinder: points and outward normals (point, 3), from its middle, metres."""
-    radius, half = pusher.radius, pusher.length / 2
-    side, cap = 2 * half, radius / 2  # areas over 2 pi radius
-    num_caps = round(pusher.num_points * cap / (side + 2 * cap))
-    num_side = pusher.num_points - 2 * num_caps
-    index = np.arange(num_side) + 0.5
-    angle = index * _GOLDEN_ANGLE
-    outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(num_side)], axis=1)
-    points, normals = [outward * radius + [[0, 0, 1]] * (half * (2 * index / num_side - 1))[:, None]], [outward]
-    for sign in (-1.0, 1.0):
-        index = np.arange(num_caps) + 0.5
-        away, angle = radius * np.sqrt(index / max(num_caps, 1)), index * _GOLDEN_ANGLE
-        points.append(np.stack([away * np.cos(angle), away * np.sin(angle), np.full(num_caps, sign * half)], axis=1))
-        normals.append(np.tile([0.0, 0.0, sign], (num_caps, 1)))
-    return np.concatenate(points), np.concatenate(normals)
+    @property
+    def place(self) -> NDArray[np.float64]:
+        """Where the pusher is (2,), metres."""
+        return place_of(self.settings, self.data.qpos[-2:])

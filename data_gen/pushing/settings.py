@@ -1,5 +1,6 @@
 """Settings of the pushing scene: no value stands here, all of them stand in ``conf/data_gen/pushing/``."""
 
+import math
 from dataclasses import dataclass
 
 from omegaconf import MISSING
@@ -60,6 +61,18 @@ class PusherSettings:
 
 
 @dataclass
+class ArmSettings:
+    """An arm that carries the pusher, above all bodies; ``links`` empty: the pusher moves by itself."""
+
+    links: list[float] = MISSING  # m, upper arm and forearm
+    base: list[float] = MISSING  # m, x and y of the column
+    radius: float = MISSING  # m, of column and links
+    mass: float = MISSING  # kg, of each link
+    color: list[float] = MISSING
+    num_points: int = MISSING  # on the surface of each link, written into the file
+
+
+@dataclass
 class LightSettings:
     """One directional light with a cast shadow, and ambient light."""
 
@@ -76,6 +89,7 @@ class PushingSettings(SceneSettings):
     table: TableSettings = MISSING
     bodies: BodySettings = MISSING
     pusher: PusherSettings = MISSING
+    arm: ArmSettings = MISSING
     light: LightSettings = MISSING
 
     def __post_init__(self) -> None:
@@ -101,9 +115,33 @@ class PushingSettings(SceneSettings):
             require(len(ends) == 2 and 0 < ends[0] <= ends[1], name, list(ends), "least and largest, above 0")
         for name in ("radius", "length", "clearance", "mass", "stiffness", "damping", "max_force"):
             require(getattr(pusher, name) > 0, f"pusher.{name}", getattr(pusher, name), "above 0")
+        self._check_arm()
         require(0 <= pusher.task_share <= 1, "pusher.task_share", pusher.task_share, "0 to 1")
         require(8 <= pusher.num_points <= 10_000, "pusher.num_points", pusher.num_points, "8 to 10,000")
         require(self.light.direction[2] < 0, "light.direction", self.light.direction, "a downward direction")
+
+    def _check_arm(self) -> None:
+        arm = self.arm
+        if not arm.links:
+            return
+        require(
+            len(arm.links) == 2 and min(arm.links) > 0, "arm.links", list(arm.links), "none, or two lengths above 0"
+        )
+        require(len(arm.base) == 2, "arm.base", list(arm.base), "x and y")
+        for name in ("radius", "mass"):
+            require(getattr(arm, name) > 0, f"arm.{name}", getattr(arm, name), "above 0")
+        require(8 <= arm.num_points <= 10_000, "arm.num_points", arm.num_points, "8 to 10,000")
+        limit = [half + self.pusher.overhang for half in self.table.half_size]
+        away = [max(0.0, abs(x) - end) for x, end in zip(arm.base, limit, strict=True)]
+        far = [abs(x) + end for x, end in zip(arm.base, limit, strict=True)]
+        reach = f"{abs(arm.links[0] - arm.links[1]):.3g} to {sum(arm.links):.3g} m from arm.base, as the pusher may be"
+        fits = math.hypot(*away) > abs(arm.links[0] - arm.links[1]) and math.hypot(*far) < sum(arm.links)
+        require(fits, "arm.links", list(arm.links), f"a reach ({reach}) that covers {limit} m about the origin")
+
+    @property
+    def arm_height(self) -> float:
+        """Height of the arm's links above the table, metres: the pusher hangs from them."""
+        return self.pusher_height + self.pusher.length / 2 + self.arm.radius
 
     @property
     def delay_steps(self) -> int:

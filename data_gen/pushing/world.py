@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.cameras import camera_intrinsics, camera_poses
+from data_gen.pushing.arm import cylinder_surface
 from data_gen.pushing.bodies import PlacedBody, draw_bodies
 from data_gen.pushing.model import labels_of
 from data_gen.pushing.motion import CommandedPath
-from data_gen.pushing.scene import Pushing, cylinder_surface
+from data_gen.pushing.scene import Pushing
 from data_gen.pushing.settings import PushingSettings
 from data_gen.renderers import Renderer, open_renderer
 from vpd_lightning.errors import RenderingBackendError, one_line
@@ -35,10 +36,13 @@ class PushingWorld:
     anywhere beside the bodies. ``backend`` null: without pictures.
 
     Raises:
+        ValueError: an arm carries the pusher.
         RenderingBackendError: MuJoCo cannot draw by the backend in this process.
     """
 
     def __init__(self, settings: PushingSettings, seed: int, backend: str | None) -> None:
+        if settings.arm.links:
+            raise ValueError("a world to act in has a pusher that moves by itself: set arm.links=[]")
         generator = np.random.default_rng([seed, 90_210])
         self.settings = replace(settings, num_frames=1)
         self.bodies: list[PlacedBody] = draw_bodies(settings, generator)
@@ -72,7 +76,7 @@ class PushingWorld:
     @property
     def pusher(self) -> NDArray[np.float64]:
         """Where the pusher's middle is, as measured (3,), metres."""
-        return np.array([*self._pushing.data.qpos[-2:], self.settings.pusher_height])
+        return np.array([*self._pushing.place, self.settings.pusher_height])
 
     @property
     def places(self) -> NDArray[np.float64]:
@@ -122,7 +126,8 @@ class PushingWorld:
 
     def pusher_surface(self, pusher: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return points and normals on the pusher whose middle is there (point, 3)."""
-        points, normals = cylinder_surface(self.settings.pusher)
+        shape = self.settings.pusher
+        points, normals = cylinder_surface(shape.radius, shape.length, shape.num_points)
         return points + pusher, normals
 
     def copy(self) -> "PushingWorld":

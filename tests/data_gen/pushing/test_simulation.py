@@ -5,11 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from data_gen.pushing.arm import cylinder_surface, joints_of, link_poses, link_surfaces, place_of
 from data_gen.pushing.bodies import PlacedBody, draw_bodies
 from data_gen.pushing.motion import CommandedPath, draw_path
-from data_gen.pushing.scene import Pushing, cylinder_surface
+from data_gen.pushing.scene import Pushing
 from data_gen.pushing.settings import PushingSettings
 from data_gen.settings import load_settings
+from vpd_lightning.errors import ConfigError
 
 
 def loaded(**overrides: Any) -> PushingSettings:
@@ -72,6 +74,65 @@ def test_the_pusher_follows_its_command_by_the_time_that_its_control_takes() -> 
     assert driven.commanded_poses[frame, 0, :2, 3] == pytest.approx(path.at(frame * settings.frame_time))
 
 
+ARM = {"arm.links": [0.52, 0.5]}
+
+
+@pytest.mark.parametrize("place", [(0.3, 0.2), (-0.39, 0.0), (0.4, -0.35), (0.0, 0.0)])
+def test_the_arm_brings_the_pusher_where_it_should_be(place: tuple[float, float]) -> None:
+    settings = loaded(**ARM)
+    joints = joints_of(settings, np.array(place))
+    assert place_of(settings, joints) == pytest.approx(place, abs=1e-9)
+    assert place_of(loaded(), joints_of(loaded(), np.array(place))) == pytest.approx(place)
+
+
+def test_links_and_their_points_are_where_mujoco_has_them() -> None:
+    import mujoco
+
+    settings = loaded(**ARM)
+    pushing = Pushing(settings, [cube([0.0, 0.2])], straight([-0.2, -0.1], [0.3, 0.1], seconds=1.0))
+    for _ in range(300):
+        pushing._advance()
+    mujoco.mj_kinematics(pushing.model, pushing.data)
+    poses = link_poses(settings, pushing.data.qpos[-2:])
+    points, normals, groups = link_surfaces(settings)
+    assert len(poses) == 4 and len(points) == 3 * settings.arm.num_points + settings.pusher.num_points
+    for link, name in enumerate(("column", "upper", "fore", "pusher")):
+        body = pushing.data.body(name)
+        assert poses[link, :3, 3] == pytest.approx(body.xpos, abs=1e-6)
+        assert poses[link, :3, :3].ravel() == pytest.approx(body.xmat, abs=1e-6)
+        geom = int(pushing.model.body(name).geomadr[0])
+        local = points[groups == link] @ poses[link, :3, :3].T + poses[link, :3, 3] - pushing.data.geom_xpos[geom]
+        local = local @ pushing.data.geom_xmat[geom].reshape(3, 3)
+        radius, half = pushing.model.geom_size[geom, :2]
+        on_side = np.abs(np.linalg.norm(local[:, :2], axis=1) - radius) < 1e-6
+        on_cap = np.abs(np.abs(local[:, 2]) - half) < 1e-6
+        assert (on_side | on_cap).all() and on_side.mean() > 0.5
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0)
+
+
+def test_an_arm_pushes_as_the_pusher_by_itself_does() -> None:
+    path = straight([-0.2, 0.0], [0.1, 0.0], seconds=1.4)
+    alone, there = simulated(loaded(), [cube([0.0, 0.0])], path)
+    carried, here = simulated(loaded(**ARM), [cube([0.0, 0.0])], path)
+    assert here[-1, 0] == pytest.approx(there[-1, 0], abs=0.02)
+    assert carried.driven_motion().points.shape[1] == 4 * 64
+    assert carried.place == pytest.approx(alone.place, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"arm.links": [0.5]}, "two lengths"),
+        ({"arm.links": [0.3, 0.3]}, "a reach"),
+        ({"arm.links": [0.9, 0.3]}, "a reach"),
+        ({"arm.links": [0.52, 0.5], "arm.radius": 0.0}, "arm.radius"),
+    ],
+)
+def test_an_arm_that_does_not_reach_is_refused(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        loaded(**settings)
+
+
 def test_with_a_camera_delay_the_action_is_that_of_a_moment_after_the_picture() -> None:
     path = straight([-0.2, 0.2], [0.2, 0.2], seconds=1.0)
     bodies = [cube([0.0, -0.2])]
@@ -117,7 +178,7 @@ def test_a_path_keeps_its_speeds_and_lasts_long_enough(task_share: float) -> Non
 
 def test_points_lie_evenly_on_the_pusher() -> None:
     pusher = loaded(**{"pusher.num_points": 4000}).pusher
-    points, normals = cylinder_surface(pusher)
+    points, normals = cylinder_surface(pusher.radius, pusher.length, pusher.num_points)
     away, half = np.hypot(points[:, 0], points[:, 1]), pusher.length / 2
     is_side = np.abs(normals[:, 2]) < 0.5
     np.testing.assert_allclose(away[is_side], pusher.radius)
