@@ -13,8 +13,7 @@ from vpd_lightning.dynamics.inertial.contact import (
     Resolved,
     nearest_body_contacts,
 )
-from vpd_lightning.dynamics.inertial.dynamics import _elastic
-from vpd_lightning.dynamics.inertial.materials import Materials
+from vpd_lightning.dynamics.inertial.materials import Materials, elastic
 from vpd_lightning.dynamics.inertial.rigid_motion import rotate, rotation_from_spin
 
 FAR = 10.0
@@ -93,7 +92,7 @@ class World:
         """Return this step after weight, elastic return and contact."""
         weight = self.positions.new_tensor([0.0, 0.0, -self.gravity])
         free = replace(self.motion, displacements=self.motion.displacements + weight)
-        free = replace(free, strains=_elastic(free, self.materials))
+        free = replace(free, strains=elastic(free, self.materials))
         points = ContactPoints(self.positions, self.normals, self.members)
         static = floor_contacts(self.positions) if self.has_floor else nothing_near(self.positions)
         between = None

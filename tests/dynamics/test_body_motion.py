@@ -9,8 +9,7 @@ import torch
 
 from tests.dynamics.solids import even_ball, even_cube, random_rotation, rotation_about
 from vpd_lightning.dynamics.inertial.body_motion import MAX_STRAIN, BodyMotion, Inertia, body_inertia
-from vpd_lightning.dynamics.inertial.dynamics import _elastic
-from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
+from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials, elastic
 from vpd_lightning.dynamics.inertial.rigid_motion import rotation_from_spin
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -209,7 +208,7 @@ def test_a_stretch_swings_back_as_the_damped_recurrence_says(stiffness, damping)
         np.vstack([np.ones(2), roots]), np.array([start, start * (1 - stiffness)], dtype=complex)
     )
     for step in range(1, 60):
-        state = replace(state, strains=_elastic(state, materials))
+        state = replace(state, strains=elastic(state, materials))
         stretch, strain = state.following_stretches()
         state = replace(state, stretches=stretch, strains=strain)
         expected = (coefficients @ roots**step).real
@@ -222,7 +221,7 @@ def test_any_stiffness_and_damping_below_one_is_stable():
         for damping in (0.0, 0.5, 1.0):
             state, materials = motion(EYE + symmetric(6, 0.2), symmetric(7, 0.1)), soft(stiffness, damping)
             for _ in range(400):
-                state = replace(state, strains=_elastic(state, materials))
+                state = replace(state, strains=elastic(state, materials))
                 stretch, strain = state.following_stretches()
                 state = replace(state, stretches=stretch, strains=strain)
                 assert (stretch[0, 0] - EYE).norm() <= MAX_STRAIN + 1e-9

@@ -29,6 +29,7 @@ SETTINGS = {
     "contact_range": 0.5,
     "contact_reach": 5.0,
     "num_contact_iterations": 4,
+    "num_contact_substeps": None,
     "max_contact_depth": 0.06,
     "mirror_hidden": True,
     "is_soft": False,

@@ -53,6 +53,7 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {  # switches that change how a
     },
     "surface": {"brute_force": {"candidate_backend": "torch"}},
     "splat": {"brute_force": {"candidate_backend": "torch"}},
+    "inertial": {"substeps": {"num_contact_substeps": 4}},
     "hierarchical_gnn": {
         "static_shapes": {"edge_capacity": 512},
         "nearest_abstract_nodes": {"max_abstract_edges_per_node": 4},

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from docs.results.studies.changed_dynamics import add_option, change_dynamics
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
 from vpd_lightning.evaluation.prediction import encode_clip, roll_out_clip, takes_actions
@@ -123,13 +124,15 @@ def main() -> None:
     parser.add_argument("models", nargs="+", help="NAME=CKPT")
     parser.add_argument("--split", default="test")
     parser.add_argument("--starts", type=int, nargs="+", default=[0, 6, 12])
+    add_option(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     result = json.loads(options.out.read_text()) if options.out.is_file() else {}
     for words in options.models:
         name, ckpt = words.split("=", 1)
         model = load_model(ckpt)
-        result[name] = measured(model, options.data, options.split, options.starts)
+        changes = change_dynamics(model, options.dynamics)
+        result[name] = {**measured(model, options.data, options.split, options.starts), "dynamics": changes}
         with AtomicPath(options.out) as path:
             path.write_text(json.dumps(result, indent=1) + "\n")
         print_table(name, result[name])

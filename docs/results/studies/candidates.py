@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from docs.results.studies.changed_dynamics import add_option, change_dynamics
 from vpd_lightning.data.clip import read_clip
 from vpd_lightning.evaluation.prediction import encode_clip
 from vpd_lightning.files import AtomicPath
@@ -71,13 +72,11 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=256)
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--single", type=int, default=16)
-    parser.add_argument("--dynamics", nargs="*", default=[], help="settings of the model's dynamics, KEY=JSON")
+    add_option(parser)
     options = parser.parse_args()
     model = load_model(options.ckpt)
-    for word in options.dynamics:
-        key, value = word.split("=", 1)
-        setattr(model.simulator.dynamics, key, json.loads(value))
-    found = measured(model, options.data, options.count, options.steps, options.single)
+    changes = change_dynamics(model, options.dynamics)
+    found = {**measured(model, options.data, options.count, options.steps, options.single), "dynamics": changes}
     with AtomicPath(options.out) as path:
         path.write_text(json.dumps(found, indent=1) + "\n")
     print(json.dumps(found, indent=1))

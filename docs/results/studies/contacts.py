@@ -31,6 +31,7 @@ from data_gen.pushing.bodies import draw_bodies
 from data_gen.pushing.model import compile_model
 from data_gen.pushing.settings import PushingSettings
 from data_gen.settings import SPLIT_CODES, load_settings
+from docs.results.studies.changed_dynamics import add_option, change_dynamics
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.evaluation.bodies import find_bodies
@@ -221,6 +222,7 @@ def main() -> None:
     parser.add_argument("models", nargs="*", help="NAME=CKPT")
     parser.add_argument("--split", default="test")
     parser.add_argument("--starts", type=int, nargs="+", default=[0, 6, 12])
+    add_option(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     manifest = load_manifest(options.data)
@@ -229,7 +231,9 @@ def main() -> None:
     for words in ["truth=", *options.models]:
         name, ckpt = words.split("=", 1)
         model = load_model(ckpt) if ckpt else None
-        result[name] = measured(model, options.data, options.split, options.starts, settings, manifest.seed)
+        changes = {} if model is None else change_dynamics(model, options.dynamics)
+        found = measured(model, options.data, options.split, options.starts, settings, manifest.seed)
+        result[name] = {**found, "starts": options.starts, "dynamics": changes}
         with AtomicPath(options.out) as path:
             path.write_text(json.dumps(result, indent=1) + "\n")
         print(name, json.dumps(result[name], indent=1))

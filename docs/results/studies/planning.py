@@ -18,6 +18,7 @@ import torch
 
 from data_gen.pushing.settings import PushingSettings
 from data_gen.settings import load_settings
+from docs.results.studies.changed_dynamics import add_option, change_dynamics
 from vpd_lightning.files import AtomicPath
 from vpd_lightning.planning.closed_loop import Loop, run_with_model, run_with_truth, run_without_action
 from vpd_lightning.planning.solvers import CrossEntropy, RandomShooting
@@ -25,7 +26,7 @@ from vpd_lightning.planning.tasks import KINDS, draw_task
 from vpd_lightning.planning.tool import PlanarTool
 
 FIRST_SEED = 1000
-NUM_SAMPLES, NUM_ITERATIONS, NUM_ELITES, SPREAD = 64, 2, 8, 0.7
+NUM_SAMPLES, NUM_ITERATIONS, NUM_ELITES, SPREAD = 32, 2, 5, 0.7
 NUM_KNOTS, HOLD, NUM_EXECUTED, NUM_DECISIONS = 6, 4, 2, 10
 MAX_SPEED = 0.016  # metres a frame: 0.4 m/s
 _SETTINGS = {
@@ -99,7 +100,7 @@ def main() -> None:
     parser.add_argument("--systems", nargs="+", default=["nothing", "truth", "model", "random"])
     parser.add_argument("--tasks", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--dynamics", nargs="*", default=[], help="settings of the model's dynamics, KEY=JSON")
+    add_option(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -107,10 +108,7 @@ def main() -> None:
 
     name, ckpt = options.model.split("=", 1)
     model = load_model(ckpt) if {"model", "random"} & set(options.systems) else None
-    if model is not None:  # what makes it faster; the weights stay
-        for word in options.dynamics:
-            key, value = word.split("=", 1)
-            setattr(model.simulator.dynamics, key, json.loads(value))
+    changes = {} if model is None else change_dynamics(model, options.dynamics)  # what makes it faster
     settings = load_settings(PushingSettings, "pushing", "small", {})
     for number in range(options.first, options.tasks):
         for kind in options.kinds:
@@ -123,7 +121,7 @@ def main() -> None:
                 result = json.loads(options.out.read_text()) if options.out.is_file() else {"model": name, "tasks": {}}
                 result["tasks"][key] = found
                 result["rates"] = rates(result["tasks"])
-                result["settings"] = {**_SETTINGS, "dynamics of model": options.dynamics}
+                result["settings"] = {**_SETTINGS, "dynamics of model": changes}
                 with AtomicPath(options.out) as path:
                     path.write_text(json.dumps(result, indent=1, sort_keys=True) + "\n")
                 print(key, found, flush=True)

@@ -39,6 +39,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "carry_memory": True,
         "extent_weight": 0.0,
         "acceleration_gain": 1.0,
+        "num_contact_substeps": None,
         "guess_hidden": False,
         "has_driven": False,
         "edge_reach": None,

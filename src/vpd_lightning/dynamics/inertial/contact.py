@@ -188,8 +188,7 @@ class ContactSolver:
         max_depth: float,
     ) -> Resolved:
         """Return the step without penetration; ``static`` describes what stands still near each point."""
-        known = (static.normals.square().sum(dim=-1) > 0.5) & (static.distances > -max_depth)
-        touchable = (self.points.members > 0) & known[:, None]
+        touchable = self._touchable(static, max_depth)
         motion, touches = free, []
         touching = torch.zeros_like(self.masses, dtype=torch.bool)
         pairs: list[_Pairs] = []
@@ -208,16 +207,15 @@ class ContactSolver:
             onward = self._bounce(onward, touch)
         return Resolved(motion, onward, touching)
 
+    def _touchable(self, static: Contacts, max_depth: float) -> Bool[Tensor, "batch body probe"]:
+        known = (static.normals.square().sum(dim=-1) > 0.5) & (static.distances > -max_depth)
+        return (self.points.members > 0) & known[:, None]
+
     def _lift(
         self, motion: BodyMotion, free: BodyMotion, contacts: Contacts, touchable: Tensor
     ) -> tuple[BodyMotion, _Touch]:
         """Lift the deepest point of each body out of what stands still, and slow its sliding."""
-        turned = motion.turned(self.offsets, self.own)
-        moves = vectors_of(motion.displacements, self.own) + turned - self.offsets
-        ahead = contacts.distances + (moves * contacts.normals).sum(dim=-1)
-        deepest, probe = ahead[:, None].masked_fill(~touchable, torch.inf).min(dim=-1)
-        deepest = deepest[..., None]
-        normal, arm, move = (vectors_of(values, probe) for values in (contacts.normals, turned, moves))
+        deepest, normal, arm, move = self._deepest(motion, contacts, touchable)
         lift = torch.relu(-deepest) / self.inertia.response(arm, normal)
         push = self.inertia.push(arm, lift * normal)
         motion = motion.pushed(push)
@@ -232,6 +230,17 @@ class ContactSolver:
         approach = -(_velocity(_as_push(free), arm) * normal).sum(dim=-1, keepdim=True)
         return motion, _Touch(arm, normal, approach, (lift > 0) & torch.isfinite(deepest))
 
+    def _deepest(
+        self, motion: BodyMotion, contacts: Contacts, touchable: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return distance, normal, arm and motion of the point of each body that is deepest after a motion."""
+        turned = motion.turned(self.offsets, self.own)
+        moves = vectors_of(motion.displacements, self.own) + turned - self.offsets
+        ahead = contacts.distances + (moves * contacts.normals).sum(dim=-1)
+        deepest, probe = ahead[:, None].masked_fill(~touchable, torch.inf).min(dim=-1)
+        normal, arm, move = (vectors_of(values, probe) for values in (contacts.normals, turned, moves))
+        return deepest[..., None], normal, arm, move
+
     def _bounce(self, motion: BodyMotion, touch: _Touch) -> BodyMotion:
         """Give back a share of the approach, or at least take all of it away."""
         speed = (_velocity(_as_push(motion), touch.arms) * touch.normals).sum(dim=-1, keepdim=True)
@@ -239,8 +248,10 @@ class ContactSolver:
         lift = torch.relu(wanted - speed) / self.inertia.response(touch.arms, touch.normals)
         return motion.pushed(self.inertia.push(touch.arms, lift * touch.is_active * touch.normals))
 
-    def _part(self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts) -> tuple[BodyMotion, "_Pairs"]:
-        """Push apart each pair of bodies at its deepest contact, half as far as needed from either side."""
+    def _pairs(
+        self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts
+    ) -> tuple["_Pairs", Float[Tensor, "batch pair 1"]]:
+        """Return the deepest contact of each pair of bodies after a motion, and how deep it is (metres)."""
         own, turned = self.own, motion.turned(self.offsets, self.own)
         there = vectors_of(motion.centers + motion.displacements, own) + turned
         facing = rotate(matrices_of(rotation_from_spin(motion.spins), own), self.points.normals)
@@ -272,7 +283,11 @@ class ContactSolver:
             approach=torch.zeros_like(depth),
             is_active=depth > 0,
         )
-        pairs = replace(pairs, approach=-(pairs.relative(free) * pairs.normals).sum(dim=-1, keepdim=True))
+        return replace(pairs, approach=-(pairs.relative(free) * pairs.normals).sum(dim=-1, keepdim=True)), depth
+
+    def _part(self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts) -> tuple[BodyMotion, "_Pairs"]:
+        """Push apart each pair of bodies at its deepest contact, half as far as needed from either side."""
+        pairs, depth = self._pairs(motion, free, contacts)
         impulse = 0.5 * depth / self._pair_response(pairs, pairs.normals)
         sliding = pairs.relative(motion)
         sliding = sliding - (sliding * pairs.normals).sum(dim=-1, keepdim=True) * pairs.normals

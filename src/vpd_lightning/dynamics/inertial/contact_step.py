@@ -17,6 +17,7 @@ from vpd_lightning.dynamics.inertial.driven_bodies import (
     meet,
 )
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
+from vpd_lightning.dynamics.inertial.substeps import SubstepSolver
 
 
 def resolved_contacts(
@@ -32,12 +33,15 @@ def resolved_contacts(
     is_mirrored: bool,
     rest_speed: float,
     num_iterations: int,
+    num_substeps: int | None,
     max_depth: float,
 ) -> Resolved:
     """Return the step after contact of ``points`` with what stands still (``contacts``), each other and what is driven.
 
-    ``motion`` is the step that bodies would take without; what is driven is left out of the result.
+    ``motion`` is the step that bodies would take without; what is driven is left out of the result. With
+    ``num_substeps`` it is resolved in so many parts (``SubstepSolver``), else at once in ``num_iterations``.
     """
+    before = memory.motion
     between, materials, masses = between_bodies(points, memory), memory.materials, memory.masses
     num_bodies, met = masses.shape[1], None
     if driven is not None:
@@ -47,12 +51,14 @@ def resolved_contacts(
         assert driven_friction is not None
         points, contacts, between = met.points, met.static, met.between
         count = driven.members.shape[1]
+        before = joined_motion(before, driven.motion)
         motion, inertia = joined_motion(motion, driven.motion), joined_inertia(inertia, count)
         materials = joined_materials(materials, driven_friction, count)
         # Ratios alone matter, and the square of a small body's volume is no float32.
         masses = masses / masses.detach().amax(dim=1, keepdim=True)
         masses = torch.cat([masses, torch.full_like(masses[:, :1], torch.inf).expand(-1, count, -1)], dim=1)
-    solver = ContactSolver(
+    kind = ContactSolver if num_substeps is None else SubstepSolver
+    solver = kind(
         points=points,
         centers=motion.centers,
         inertia=inertia,
@@ -61,7 +67,13 @@ def resolved_contacts(
         rest_speed=rest_speed,
         num_driven=masses.shape[1] - num_bodies,
     )
-    resolved = solver.resolve(motion, contacts, between, num_iterations=num_iterations, max_depth=max_depth)
+    if isinstance(solver, SubstepSolver):
+        assert num_substeps is not None
+        resolved = solver.resolve_in_parts(
+            before, motion, contacts, between, num_substeps=num_substeps, max_depth=max_depth
+        )
+    else:
+        resolved = solver.resolve(motion, contacts, between, num_iterations=num_iterations, max_depth=max_depth)
     if met is not None:
         return resolved.first(num_bodies)
     if driven_friction is None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from vpd_lightning.dynamics.base import AbstractDynamics
@@ -31,7 +31,7 @@ from vpd_lightning.dynamics.inertial.first_motion import (
 )
 from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity
 from vpd_lightning.dynamics.inertial.hidden_side import HiddenGuess, hidden_after
-from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, Materials
+from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, elastic
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
 from vpd_lightning.dynamics.inertial.resting import held, is_slow, members_in_use, rested, rows_of, with_rows
 from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, rotate, rotation_from_spin
@@ -74,6 +74,8 @@ class InertialDynamics(AbstractDynamics):
     ``supported_speed`` (in ``force_scale``, per step) when it is first seen stands on it, whatever of its foot was seen
     (``static_surface``), and one that stands still does until something pushes it (``resting.held``).
 
+    With ``num_contact_substeps`` contact is resolved in so many parts of a step (``SubstepSolver``); null: at once.
+
     With ``skip_resting``, and without gradients, a member of the batch in which all bodies rest (in contact, slower
     than ``rest_share``) and nothing driven is about to push one stays as it is.
 
@@ -106,6 +108,7 @@ class InertialDynamics(AbstractDynamics):
         contact_range: float,
         contact_reach: float,
         num_contact_iterations: int,
+        num_contact_substeps: int | None,
         max_contact_depth: float,
         mirror_hidden: bool,
         is_soft: bool,
@@ -121,7 +124,8 @@ class InertialDynamics(AbstractDynamics):
         skip_resting: bool,
     ):
         super().__init__()
-        for name, value in (("num_bodies", num_bodies), ("num_probes", num_probes)):
+        counts = {"num_bodies": num_bodies, "num_probes": num_probes, "num_contact_substeps": num_contact_substeps or 1}
+        for name, value in counts.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
         for name, scale in (("body_link", body_link), ("location_scale", location_scale), ("force_scale", force_scale)):
@@ -138,7 +142,8 @@ class InertialDynamics(AbstractDynamics):
         self.body_link, self.max_concavity, self.max_concave_share = body_link, max_concavity, max_concave_share
         self.force_scale, self.rest_share = force_scale, rest_share
         self.contact_range, self.contact_reach = contact_range, contact_reach
-        self.num_contact_iterations, self.max_contact_depth = num_contact_iterations, max_contact_depth
+        self.num_contact_iterations, self.num_contact_substeps = num_contact_iterations, num_contact_substeps
+        self.max_contact_depth = max_contact_depth
         self.mirror_hidden, self.keep_shape, self.carry_memory = mirror_hidden, keep_shape, carry_memory
         self.first_velocity, self.extent_weight = first_velocity, extent_weight
         self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
@@ -362,7 +367,7 @@ class InertialDynamics(AbstractDynamics):
             memory.motion,
             inertia,
         )
-        motion = held(replace(motion, strains=_elastic(motion, materials)), memory.undisturbed)
+        motion = held(replace(motion, strains=elastic(motion, materials)), memory.undisturbed)
         return resolved_contacts(
             motion,
             inertia,
@@ -375,6 +380,7 @@ class InertialDynamics(AbstractDynamics):
             is_mirrored=self.mirror_hidden,
             rest_speed=_BOUNCE_SHARE * self.force_scale,
             num_iterations=self.num_contact_iterations,
+            num_substeps=self.num_contact_substeps,
             max_depth=self.max_contact_depth,
         )
 
@@ -390,10 +396,3 @@ class InertialDynamics(AbstractDynamics):
         static = static + (shade - memory.static_shade)
         features = put(current.features, memory.index, moving, memory.mask)
         return put(features, memory.static_index, static, memory.static_mask)
-
-
-def _elastic(motion: BodyMotion, materials: Materials) -> Float[Tensor, "batch body 3 3"]:
-    """Return the strains of a damped oscillation about the first shape; one semi-implicit step, stable for any."""
-    eye = torch.eye(3, dtype=motion.strains.dtype, device=motion.strains.device)
-    carried = motion.strains * (1 - materials.damping)[..., None]
-    return carried - materials.stiffness[..., None] * (motion.stretches - eye)

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
+
 _GAIN = 4.0
 """Softness spans orders of magnitude and begins at its small end; a rate that suits the others would be too slow."""
 
@@ -63,6 +65,13 @@ class MaterialNetwork(nn.Module):
             stiffness=torch.sigmoid(stiffness),
             damping=torch.sigmoid(damping),
         )
+
+
+def elastic(motion: BodyMotion, materials: Materials) -> Float[Tensor, "batch body 3 3"]:
+    """Return the strains of a damped oscillation about the first shape; one semi-implicit step, stable for any."""
+    eye = torch.eye(3, dtype=motion.strains.dtype, device=motion.strains.device)
+    carried = motion.strains * (1 - materials.damping)[..., None]
+    return carried - materials.stiffness[..., None] * (motion.stretches - eye)
 
 
 def _logit(share: float) -> float:

@@ -1,0 +1,106 @@
+"""Contact in parts of a step: what slides stands on its foot, because weight pulls between one push and the next."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
+from vpd_lightning.dynamics.inertial.contact import BodyContacts, Contacts, ContactSolver, Resolved, _as_push, _velocity
+
+
+class SubstepSolver(ContactSolver):
+    """Moves bodies in ``num_substeps`` equal parts of a step (as small steps in Macklin et al. 2019).
+
+    In each part the velocity takes its share of the forces, then impulses at the contacts: no approach is left but what
+    bounces, and friction is at most its coefficient times the impulse (Coulomb). What still penetrates is moved out
+    without a change of velocity. A whole step at once applies the friction of its whole weight at one point, and tips
+    what slides: no later push takes it back.
+    """
+
+    def resolve_in_parts(
+        self,
+        before: BodyMotion,
+        free: BodyMotion,
+        static: Contacts,
+        between: BodyContacts | None,
+        *,
+        num_substeps: int,
+        max_depth: float,
+    ) -> Resolved:
+        """Return the step; ``before`` is the velocity with which bodies came, ``free`` that after all forces."""
+        touchable = self._touchable(static, max_depth)
+        share = 1.0 / num_substeps
+        done = _scaled(free, 0.0)
+        velocity, touching = before, torch.zeros_like(self.masses, dtype=torch.bool)
+        for _ in range(num_substeps):
+            velocity = _added(velocity, free, before, share)
+            if between is not None:
+                trial = _moved(done, velocity, share)
+                pairs, depth = self._pairs(trial, velocity, between)
+                changed = self._hit_apart(velocity, pairs)
+                closing = (pairs.relative(changed) - pairs.relative(velocity)) * pairs.normals
+                left = torch.relu(depth - share * closing.sum(dim=-1, keepdim=True))
+                push = 0.5 * left / self._pair_response(pairs, pairs.normals) * pairs.is_active
+                done = self._pair_pushed(done, pairs, push * pairs.normals)
+                velocity, touching = changed, touching | pairs.touching
+            trial = _moved(done, velocity, share)
+            deepest, normal, arm, _ = self._deepest(trial, static, touchable)
+            is_active = (deepest < 0) & torch.isfinite(deepest)
+            changed = self._hit(velocity, arm, normal, is_active)
+            closing = ((_velocity(_as_push(changed), arm) - _velocity(_as_push(velocity), arm)) * normal).sum(-1)
+            left = torch.relu(-deepest - share * closing[..., None])
+            lift = torch.where(is_active, left, 0.0) / self.inertia.response(arm, normal)
+            done = done.pushed(self.inertia.push(arm, lift * normal))
+            velocity, touching = changed, touching | is_active
+            done = _moved(done, velocity, share)
+        return Resolved(done, velocity, touching)
+
+    def _hit(self, velocity: BodyMotion, arm: Tensor, normal: Tensor, is_active: Tensor) -> BodyMotion:
+        """Take the approach to what stands still, give back what bounces, and slow the sliding."""
+        speed = (_velocity(_as_push(velocity), arm) * normal).sum(dim=-1, keepdim=True)
+        wanted = self.materials.restitution * torch.relu(-speed - self.rest_speed)
+        lift = torch.relu(wanted - speed) * is_active / self.inertia.response(arm, normal)
+        velocity = velocity.pushed(self.inertia.push(arm, lift * normal))
+        move = _velocity(_as_push(velocity), arm)
+        sliding = move - (move * normal).sum(dim=-1, keepdim=True) * normal
+        size = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+        direction = sliding / size
+        stop = size / self.inertia.response(arm, direction)
+        drag = -torch.minimum(stop, self.materials.friction * lift) * direction
+        return velocity.pushed(self.inertia.push(arm, drag))
+
+    def _hit_apart(self, velocity: BodyMotion, pairs: "object") -> BodyMotion:
+        """The same between bodies, half of it from either side of a pair."""
+        relative = pairs.relative(velocity)  # type: ignore[attr-defined]
+        normals = pairs.normals  # type: ignore[attr-defined]
+        speed = (relative * normals).sum(dim=-1, keepdim=True)
+        wanted = self._pair_mean(self.materials.restitution, pairs) * torch.relu(-speed - self.rest_speed)  # type: ignore[arg-type]
+        response = self._pair_response(pairs, normals)  # type: ignore[arg-type]
+        impulse = 0.5 * torch.relu(wanted - speed) * pairs.is_active / response  # type: ignore[attr-defined]
+        sliding = relative - speed * normals
+        size = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+        direction = sliding / size
+        friction = self._pair_mean(self.materials.friction, pairs)  # type: ignore[arg-type]
+        stop = 0.5 * size / self._pair_response(pairs, direction)  # type: ignore[arg-type]
+        drag = torch.minimum(stop, friction * impulse)
+        return self._pair_pushed(velocity, pairs, impulse * normals - drag * direction)  # type: ignore[arg-type]
+
+
+def _scaled(motion: BodyMotion, share: float) -> BodyMotion:
+    return replace(
+        motion,
+        displacements=share * motion.displacements,
+        spins=share * motion.spins,
+        strains=share * motion.strains,
+    )
+
+
+def _moved(done: BodyMotion, velocity: BodyMotion, share: float) -> BodyMotion:
+    """Return the motion so far after one more part at a velocity."""
+    return done.pushed(_as_push(_scaled(velocity, share)))
+
+
+def _added(velocity: BodyMotion, free: BodyMotion, before: BodyMotion, share: float) -> BodyMotion:
+    """Return the velocity after a share of the forces."""
+    return velocity.pushed(_as_push(_scaled(free, share))).pushed(_as_push(_scaled(before, -share)))
