@@ -26,7 +26,7 @@ from vpd_lightning.planning.tasks import KINDS, draw_task
 from vpd_lightning.planning.tool import PlanarTool
 
 FIRST_SEED = 1000
-NUM_SAMPLES, NUM_ITERATIONS, NUM_ELITES, SPREAD = 32, 2, 5, 0.7
+NUM_SAMPLES, NUM_ITERATIONS, NUM_ELITES, SPREAD = 64, 2, 8, 0.7
 NUM_KNOTS, HOLD, NUM_EXECUTED, NUM_DECISIONS = 6, 4, 2, 10
 MAX_SPEED = 0.016  # metres a frame: 0.4 m/s
 _SETTINGS = {
