@@ -120,7 +120,7 @@ def nearest_body_contacts(
 
 
 @dataclass(frozen=True)
-class _Pairs:
+class Pairs:
     """One contact of every ordered pair of bodies; those that do not touch are inactive."""
 
     first: Int[Tensor, "batch pair"]
@@ -136,7 +136,7 @@ class _Pairs:
 
     def relative(self, motion: BodyMotion) -> Float[Tensor, "batch pair 3"]:
         """Return the velocity (metres per step) of the first body's point as seen from the second's."""
-        first, second = (_velocity(_gathered(_as_push(motion), index), arms) for index, arms in self.sides())
+        first, second = (velocity_at(_gathered(as_push(motion), index), arms) for index, arms in self.sides())
         return first - second
 
     @property
@@ -191,7 +191,7 @@ class ContactSolver:
         touchable = self._touchable(static, max_depth)
         motion, touches = free, []
         touching = torch.zeros_like(self.masses, dtype=torch.bool)
-        pairs: list[_Pairs] = []
+        pairs: list[Pairs] = []
         for _ in range(num_iterations):
             if between is not None:
                 motion, pair = self._part(motion, free, between)
@@ -220,14 +220,14 @@ class ContactSolver:
         push = self.inertia.push(arm, lift * normal)
         motion = motion.pushed(push)
 
-        move = move + _velocity(push, arm)
+        move = move + velocity_at(push, arm)
         sliding = move - (move * normal).sum(dim=-1, keepdim=True) * normal
         speed = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
         direction = sliding / speed
         stop = speed / self.inertia.response(arm, direction)
         drag = -torch.minimum(stop, self.materials.friction * lift) * direction
         motion = motion.pushed(self.inertia.push(arm, drag))
-        approach = -(_velocity(_as_push(free), arm) * normal).sum(dim=-1, keepdim=True)
+        approach = -(velocity_at(as_push(free), arm) * normal).sum(dim=-1, keepdim=True)
         return motion, _Touch(arm, normal, approach, (lift > 0) & torch.isfinite(deepest))
 
     def _deepest(
@@ -243,14 +243,14 @@ class ContactSolver:
 
     def _bounce(self, motion: BodyMotion, touch: _Touch) -> BodyMotion:
         """Give back a share of the approach, or at least take all of it away."""
-        speed = (_velocity(_as_push(motion), touch.arms) * touch.normals).sum(dim=-1, keepdim=True)
+        speed = (velocity_at(as_push(motion), touch.arms) * touch.normals).sum(dim=-1, keepdim=True)
         wanted = self.materials.restitution * torch.relu(touch.approach - self.rest_speed)
         lift = torch.relu(wanted - speed) / self.inertia.response(touch.arms, touch.normals)
         return motion.pushed(self.inertia.push(touch.arms, lift * touch.is_active * touch.normals))
 
     def _pairs(
         self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts
-    ) -> tuple["_Pairs", Float[Tensor, "batch pair 1"]]:
+    ) -> tuple[Pairs, Float[Tensor, "batch pair 1"]]:
         """Return the deepest contact of each pair of bodies after a motion, and how deep it is (metres)."""
         own, turned = self.own, motion.turned(self.offsets, self.own)
         there = vectors_of(motion.centers + motion.displacements, own) + turned
@@ -274,7 +274,7 @@ class ContactSolver:
             middles = (there + vectors_of(there, contacts.other)) / 2
             place, normals = self._spread(place, normals, middles, facing, torch.where(usable, -gaps[:, None, None], 0))
         centers = motion.centers + motion.displacements
-        pairs = _Pairs(
+        pairs = Pairs(
             first=first,
             second=second,
             first_arms=place - vectors_of(centers, first),
@@ -285,7 +285,7 @@ class ContactSolver:
         )
         return replace(pairs, approach=-(pairs.relative(free) * pairs.normals).sum(dim=-1, keepdim=True)), depth
 
-    def _part(self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts) -> tuple[BodyMotion, "_Pairs"]:
+    def _part(self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts) -> tuple[BodyMotion, Pairs]:
         """Push apart each pair of bodies at its deepest contact, half as far as needed from either side."""
         pairs, depth = self._pairs(motion, free, contacts)
         impulse = 0.5 * depth / self._pair_response(pairs, pairs.normals)
@@ -317,7 +317,7 @@ class ContactSolver:
         length = mean.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
         return torch.where(chosen, weights @ middles, place), torch.where(chosen, mean / length, normals)
 
-    def _bounce_apart(self, motion: BodyMotion, pairs: "_Pairs") -> BodyMotion:
+    def _bounce_apart(self, motion: BodyMotion, pairs: Pairs) -> BodyMotion:
         """Give back a share of the approach of two bodies, or at least take all of it away."""
         speed = (pairs.relative(motion) * pairs.normals).sum(dim=-1, keepdim=True)
         wanted = self._pair_mean(self.materials.restitution, pairs) * torch.relu(pairs.approach - self.rest_speed)
@@ -325,11 +325,11 @@ class ContactSolver:
         return self._pair_pushed(motion, pairs, impulse * pairs.is_active * pairs.normals)
 
     @staticmethod
-    def _pair_mean(values: Tensor, pairs: "_Pairs") -> Tensor:
+    def _pair_mean(values: Tensor, pairs: Pairs) -> Tensor:
         """Return the geometric mean of what two bodies are made of."""
         return (vectors_of(values, pairs.first) * vectors_of(values, pairs.second)).clamp(min=1e-12).sqrt()
 
-    def _pair_response(self, pairs: "_Pairs", directions: Tensor) -> Tensor:
+    def _pair_response(self, pairs: Pairs, directions: Tensor) -> Tensor:
         """Return how far two bodies part, each at its contact, for a unit impulse."""
         each = [
             self.inertia.gathered(index).response(arm, directions) / vectors_of(self.masses, index)
@@ -337,18 +337,19 @@ class ContactSolver:
         ]
         return (each[0] + each[1]).clamp(min=1e-12)  # of two driven parts it is zero
 
-    def _pair_pushed(self, motion: BodyMotion, pairs: "_Pairs", impulses: Tensor) -> BodyMotion:
+    def _pair_pushed(self, motion: BodyMotion, pairs: Pairs, impulses: Tensor) -> BodyMotion:
         for sign, (index, arm) in zip((1, -1), pairs.sides(), strict=True):
             push = self.inertia.gathered(index).push(arm, sign * impulses / vectors_of(self.masses, index))
             motion = motion.pushed(_summed(push, index, self.points.members.shape[1]))
         return motion
 
 
-def _as_push(motion: BodyMotion) -> Push:
+def as_push(motion: BodyMotion) -> Push:
+    """Return the velocities of a motion."""
     return Push(motion.displacements, motion.spins, motion.strains)
 
 
-def _velocity(push: Push, arms: Tensor) -> Tensor:
+def velocity_at(push: Push, arms: Tensor) -> Tensor:
     """Return the velocity (metres per step) of the point at an arm."""
     return push.displacements + cross(push.spins, arms) + rotate(push.strains, arms)
 

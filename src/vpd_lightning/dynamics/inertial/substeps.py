@@ -6,7 +6,15 @@ import torch
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
-from vpd_lightning.dynamics.inertial.contact import BodyContacts, Contacts, ContactSolver, Resolved, _as_push, _velocity
+from vpd_lightning.dynamics.inertial.contact import (
+    BodyContacts,
+    Contacts,
+    ContactSolver,
+    Pairs,
+    Resolved,
+    as_push,
+    velocity_at,
+)
 
 
 class SubstepSolver(ContactSolver):
@@ -48,7 +56,7 @@ class SubstepSolver(ContactSolver):
             deepest, normal, arm, _ = self._deepest(trial, static, touchable)
             is_active = (deepest < 0) & torch.isfinite(deepest)
             changed = self._hit(velocity, arm, normal, is_active)
-            closing = ((_velocity(_as_push(changed), arm) - _velocity(_as_push(velocity), arm)) * normal).sum(-1)
+            closing = ((velocity_at(as_push(changed), arm) - velocity_at(as_push(velocity), arm)) * normal).sum(-1)
             left = torch.relu(-deepest - share * closing[..., None])
             lift = torch.where(is_active, left, 0.0) / self.inertia.response(arm, normal)
             done = done.pushed(self.inertia.push(arm, lift * normal))
@@ -58,11 +66,11 @@ class SubstepSolver(ContactSolver):
 
     def _hit(self, velocity: BodyMotion, arm: Tensor, normal: Tensor, is_active: Tensor) -> BodyMotion:
         """Take the approach to what stands still, give back what bounces, and slow the sliding."""
-        speed = (_velocity(_as_push(velocity), arm) * normal).sum(dim=-1, keepdim=True)
+        speed = (velocity_at(as_push(velocity), arm) * normal).sum(dim=-1, keepdim=True)
         wanted = self.materials.restitution * torch.relu(-speed - self.rest_speed)
         lift = torch.relu(wanted - speed) * is_active / self.inertia.response(arm, normal)
         velocity = velocity.pushed(self.inertia.push(arm, lift * normal))
-        move = _velocity(_as_push(velocity), arm)
+        move = velocity_at(as_push(velocity), arm)
         sliding = move - (move * normal).sum(dim=-1, keepdim=True) * normal
         size = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
         direction = sliding / size
@@ -70,21 +78,21 @@ class SubstepSolver(ContactSolver):
         drag = -torch.minimum(stop, self.materials.friction * lift) * direction
         return velocity.pushed(self.inertia.push(arm, drag))
 
-    def _hit_apart(self, velocity: BodyMotion, pairs: "object") -> BodyMotion:
+    def _hit_apart(self, velocity: BodyMotion, pairs: Pairs) -> BodyMotion:
         """The same between bodies, half of it from either side of a pair."""
-        relative = pairs.relative(velocity)  # type: ignore[attr-defined]
-        normals = pairs.normals  # type: ignore[attr-defined]
+        relative = pairs.relative(velocity)
+        normals = pairs.normals
         speed = (relative * normals).sum(dim=-1, keepdim=True)
-        wanted = self._pair_mean(self.materials.restitution, pairs) * torch.relu(-speed - self.rest_speed)  # type: ignore[arg-type]
-        response = self._pair_response(pairs, normals)  # type: ignore[arg-type]
-        impulse = 0.5 * torch.relu(wanted - speed) * pairs.is_active / response  # type: ignore[attr-defined]
+        wanted = self._pair_mean(self.materials.restitution, pairs) * torch.relu(-speed - self.rest_speed)
+        response = self._pair_response(pairs, normals)
+        impulse = 0.5 * torch.relu(wanted - speed) * pairs.is_active / response
         sliding = relative - speed * normals
         size = sliding.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
         direction = sliding / size
-        friction = self._pair_mean(self.materials.friction, pairs)  # type: ignore[arg-type]
-        stop = 0.5 * size / self._pair_response(pairs, direction)  # type: ignore[arg-type]
+        friction = self._pair_mean(self.materials.friction, pairs)
+        stop = 0.5 * size / self._pair_response(pairs, direction)
         drag = torch.minimum(stop, friction * impulse)
-        return self._pair_pushed(velocity, pairs, impulse * normals - drag * direction)  # type: ignore[arg-type]
+        return self._pair_pushed(velocity, pairs, impulse * normals - drag * direction)
 
 
 def _scaled(motion: BodyMotion, share: float) -> BodyMotion:
@@ -98,9 +106,9 @@ def _scaled(motion: BodyMotion, share: float) -> BodyMotion:
 
 def _moved(done: BodyMotion, velocity: BodyMotion, share: float) -> BodyMotion:
     """Return the motion so far after one more part at a velocity."""
-    return done.pushed(_as_push(_scaled(velocity, share)))
+    return done.pushed(as_push(_scaled(velocity, share)))
 
 
 def _added(velocity: BodyMotion, free: BodyMotion, before: BodyMotion, share: float) -> BodyMotion:
     """Return the velocity after a share of the forces."""
-    return velocity.pushed(_as_push(_scaled(free, share))).pushed(_as_push(_scaled(before, -share)))
+    return velocity.pushed(as_push(_scaled(free, share))).pushed(as_push(_scaled(before, -share)))
