@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 PUSHER = "pusher"
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-_ROLLING = "0.005 0.0005"  # torsional and rolling friction, m
+ROLLING = "0.005 0.0005"  # torsional and rolling friction, m: balls come to rest on the table
 
 
 def joints_of(settings: PushingSettings, place: Array) -> Array:
@@ -89,7 +89,7 @@ def tool_xml(settings: PushingSettings) -> str:
     pusher, arm = settings.pusher, settings.arm
     geom = (
         f'<geom name="{PUSHER}" type="cylinder" size="{pusher.radius!r} {pusher.length / 2!r}" mass="{pusher.mass!r}"'
-        f' material="{PUSHER}" friction="{pusher.friction!r} {_ROLLING}"/>'
+        f' material="{PUSHER}" friction="{pusher.friction!r} {ROLLING}"/>'
     )
     if not arm.links:
         return f"""

@@ -6,12 +6,10 @@ import numpy as np
 
 from data_gen.cameras import camera_xml, mjcf_numbers
 from data_gen.labels import Labels
-from data_gen.pushing.arm import PUSHER, controls_xml, tool_xml
+from data_gen.pushing.arm import PUSHER, ROLLING, controls_xml, tool_xml
 from data_gen.pushing.bodies import PlacedBody
 from data_gen.pushing.settings import PushingSettings
 from vpd_lightning.data.schema import DRIVEN_LABEL
-
-_ROLLING = "0.005 0.0005"  # torsional and rolling friction, m: balls come to rest on the table
 
 
 def compile_model(settings: PushingSettings, bodies: list[PlacedBody]) -> Any:
@@ -31,7 +29,7 @@ def _scene_xml(settings: PushingSettings, bodies: list[PlacedBody]) -> str:
     table, light, pusher = settings.table, settings.light, settings.pusher
     top = [*table.half_size, table.thickness / 2]
     foot = [0.6 * table.half_size[0], 0.6 * table.half_size[1], (table.height - table.thickness) / 2]
-    friction = f"{table.friction!r} {_ROLLING}"
+    friction = f"{table.friction!r} {ROLLING}"
     return f"""
 <mujoco model="pushing">
   <option timestep="{settings.timestep!r}" integrator="implicitfast" cone="elliptic"/>
@@ -85,5 +83,5 @@ def _body(number: int, body: PlacedBody) -> str:
     return (
         f'<body name="body{number}"><freejoint/><geom name="body{number}" type="{body.shape}" {turn}'
         f' size="{mjcf_numbers(body.mjcf_size)}" mass="{body.mass!r}" material="body{number}" condim="6"'
-        f' friction="{body.friction!r} {_ROLLING}"/></body>'
+        f' friction="{body.friction!r} {ROLLING}"/></body>'
     )

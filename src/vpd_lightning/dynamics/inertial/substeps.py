@@ -40,9 +40,10 @@ class SubstepSolver(ContactSolver):
         touchable = self._touchable(static, max_depth)
         share = 1.0 / num_substeps
         done = _scaled(free, 0.0)
+        forces = as_push(_scaled(free.pushed(as_push(_scaled(before, -1.0))), share))
         velocity, touching = before, torch.zeros_like(self.masses, dtype=torch.bool)
         for _ in range(num_substeps):
-            velocity = _added(velocity, free, before, share)
+            velocity = velocity.pushed(forces)
             if between is not None:
                 trial = _moved(done, velocity, share)
                 pairs, depth = self._pairs(trial, velocity, between)
@@ -107,8 +108,3 @@ def _scaled(motion: BodyMotion, share: float) -> BodyMotion:
 def _moved(done: BodyMotion, velocity: BodyMotion, share: float) -> BodyMotion:
     """Return the motion so far after one more part at a velocity."""
     return done.pushed(as_push(_scaled(velocity, share)))
-
-
-def _added(velocity: BodyMotion, free: BodyMotion, before: BodyMotion, share: float) -> BodyMotion:
-    """Return the velocity after a share of the forces."""
-    return velocity.pushed(as_push(_scaled(free, share))).pushed(as_push(_scaled(before, -share)))
