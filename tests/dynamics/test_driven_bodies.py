@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tests.dynamics.solids import even_ball, even_cube
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia
-from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, ContactSolver, Resolved
+from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, Resolved
 from vpd_lightning.dynamics.inertial.driven_bodies import (
     Surface,
     driven_bodies,
@@ -19,6 +19,7 @@ from vpd_lightning.dynamics.inertial.driven_bodies import (
 )
 from vpd_lightning.dynamics.inertial.materials import Materials
 from vpd_lightning.dynamics.inertial.rigid_motion import rotation_from_spin
+from vpd_lightning.dynamics.inertial.substeps import SubstepSolver
 from vpd_lightning.types import Driven
 
 HALF = 0.05
@@ -53,8 +54,10 @@ class OneBody:
         centers = torch.tensor(place).double()[None, None]
         self.motion = BodyMotion(centers, torch.zeros_like(centers), torch.zeros_like(centers), eye, 0 * eye)
 
-    def step(self, driven: Driven, friction: float = 0.0, num_iterations: int = 4) -> Resolved | None:
-        """Return the step with what is driven; None where it meets nothing."""
+    def step(
+        self, driven: Driven, friction: float = 0.0, num_iterations: int = 4, num_substeps: int | None = None
+    ) -> Resolved | None:
+        """Return the step with what is driven, at once or in parts; None where it meets nothing."""
         own = torch.zeros(1, self.positions.shape[1], dtype=torch.int64)
         bodies = driven_bodies(driven, torch.zeros(1, 1, 3).double())
         spacing = torch.tensor([2.5 * HALF / 4]).double()
@@ -71,7 +74,7 @@ class OneBody:
         shares = self.members / self.members.sum()
         inertia = body_inertia(self.positions, self.motion.centers, shares, 0 * one, torch.ones(()).double())
         motion = joined_motion(self.motion, bodies.motion)
-        solver = ContactSolver(
+        solver = SubstepSolver(
             points=met.points,
             centers=motion.centers,
             inertia=joined_inertia(inertia, 1),
@@ -80,6 +83,10 @@ class OneBody:
             rest_speed=1e-9,
             num_driven=1,
         )
+        if num_substeps is not None:
+            return solver.resolve_in_parts(
+                motion, motion, met.static, met.between, num_substeps=num_substeps, max_depth=0.1
+            )
         return solver.resolve(motion, met.static, met.between, num_iterations=num_iterations, max_depth=0.1)
 
 

@@ -10,14 +10,6 @@ from tests.dynamics.solids import even_cube
 from tests.dynamics.test_driven_bodies import HALF, OneBody, moved, plate
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia
 from vpd_lightning.dynamics.inertial.contact import BodyContacts, ContactPoints, Contacts, Resolved
-from vpd_lightning.dynamics.inertial.driven_bodies import (
-    Surface,
-    driven_bodies,
-    joined_inertia,
-    joined_materials,
-    joined_motion,
-    meet,
-)
 from vpd_lightning.dynamics.inertial.materials import Materials
 from vpd_lightning.dynamics.inertial.substeps import SubstepSolver
 
@@ -110,33 +102,8 @@ def test_what_penetrates_comes_out_without_speed() -> None:
 @pytest.mark.parametrize("gap", [0.001, 0.008])
 def test_a_plate_takes_a_cube_along_at_its_own_speed(gap: float) -> None:
     body = OneBody(even_cube(5, HALF), (HALF + gap, 0, 0))
-    driven = moved(plate(0.0), (0.02, 0, 0))
-    own = torch.zeros(1, body.positions.shape[1], dtype=torch.int64)
-    bodies = driven_bodies(driven, torch.zeros(1, 1, 3).double())
-    usable = torch.ones_like(own, dtype=torch.bool)
-    spacing, size = torch.tensor([2.5 * HALF / 4]).double(), torch.tensor([[HALF]]).double()
-    surface = Surface(body.positions, body.normals, own, usable, spacing, size)
-    far = torch.full_like(body.positions[..., 0], 10.0)
-    nothing = Contacts(far, torch.zeros_like(body.positions), far)
-    points = ContactPoints(body.positions, body.normals, body.members)
-    met = meet(bodies, surface, body.motion, points, nothing, None)
-    assert met is not None
-    one = torch.ones(1, 1, 1).double()
-    shares = body.members / body.members.sum()
-    inertia = body_inertia(body.positions, body.motion.centers, shares, 0 * one, torch.ones(()).double())
-    motion = joined_motion(body.motion, bodies.motion)
-    solver = SubstepSolver(
-        points=met.points,
-        centers=motion.centers,
-        inertia=joined_inertia(inertia, 1),
-        materials=joined_materials(
-            Materials(0 * one, 0 * one, one, 0 * one, 0.25 * one, 0.1 * one), torch.tensor(0.0).double(), 1
-        ),
-        masses=torch.cat([one, torch.full_like(one, torch.inf)], dim=1),
-        rest_speed=1e-9,
-        num_driven=1,
-    )
-    found = solver.resolve_in_parts(motion, motion, met.static, met.between, num_substeps=16, max_depth=0.1)
+    found = body.step(moved(plate(0.0), (0.02, 0, 0)), num_substeps=16)
+    assert found is not None
     assert found.onward.displacements[0, 0, 0].item() == pytest.approx(0.02, rel=0.02)
     assert found.step.displacements[0, 0, 0].item() == pytest.approx(0.02 - gap, abs=2e-3)
     assert torch.allclose(found.step.displacements[0, 1], torch.tensor([0.02, 0, 0]).double(), atol=1e-9)
