@@ -8,7 +8,6 @@ degrees, by horizon; beside them what needs no model (a constant displacement me
 any way). Intervals: 2,000 resamples of trajectories.
 """
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from docs.results.studies.changed_dynamics import add_option, change_dynamics
+from docs.results.studies.changed_dynamics import change_dynamics, parser_of
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
 from vpd_lightning.evaluation.prediction import encode_clip, roll_out_clip, takes_actions
@@ -118,14 +117,7 @@ def _means(values: NDArray[np.float64], trajectory: NDArray[np.int64]) -> dict[s
 
 def main() -> None:
     """Measure the models and print a table of each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("models", nargs="+", help="NAME=CKPT")
-    parser.add_argument("--split", default="test")
-    parser.add_argument("--starts", type=int, nargs="+", default=[0, 6, 12])
-    add_option(parser)
-    options = parser.parse_args()
+    options = parser_of(__doc__, "+").parse_args()
     torch.set_num_threads(1)
     result = json.loads(options.out.read_text()) if options.out.is_file() else {}
     for words in options.models:

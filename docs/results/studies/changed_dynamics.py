@@ -1,8 +1,9 @@
-"""Settings of a trained model's dynamics that a study changes: the weights stay, the result says what was changed."""
+"""Options of studies of trained models: models, clips, and settings of the dynamics that are changed (weights stay)."""
 
 import json
-from argparse import ArgumentParser
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from vpd_lightning.loading import LoadedModel
@@ -11,6 +12,21 @@ from vpd_lightning.loading import LoadedModel
 def add_option(parser: ArgumentParser) -> None:
     """Add ``--dynamics KEY=JSON ...``."""
     parser.add_argument("--dynamics", nargs="*", default=[], help="settings of the models' dynamics, KEY=JSON")
+
+
+def parser_of(description: str | None, least_models: str) -> ArgumentParser:
+    """Return the options of a study that measures models on the clips of a split.
+
+    ``least_models`` is argparse's ``nargs`` of the models.
+    """
+    parser = ArgumentParser(description=description, formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("models", nargs=least_models, help="NAME=CKPT")
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--starts", type=int, nargs="+", default=[0, 6, 12])
+    add_option(parser)
+    return parser
 
 
 def change_dynamics(model: LoadedModel, words: Sequence[str]) -> dict[str, Any]:

@@ -14,7 +14,6 @@ checkpoint out over 32 steps with the true action (a model without actions gets 
 Beside them the same numbers of the true motion (``truth``).
 """
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -31,7 +30,7 @@ from data_gen.pushing.bodies import draw_bodies
 from data_gen.pushing.model import compile_model
 from data_gen.pushing.settings import PushingSettings
 from data_gen.settings import SPLIT_CODES, load_settings
-from docs.results.studies.changed_dynamics import add_option, change_dynamics
+from docs.results.studies.changed_dynamics import change_dynamics, parser_of
 from vpd_lightning.data.clip import Clip, read_clip
 from vpd_lightning.data.manifest import load_manifest
 from vpd_lightning.evaluation.bodies import find_bodies
@@ -216,14 +215,7 @@ def measured(
 
 def main() -> None:
     """Measure the models and print what was found."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("models", nargs="*", help="NAME=CKPT")
-    parser.add_argument("--split", default="test")
-    parser.add_argument("--starts", type=int, nargs="+", default=[0, 6, 12])
-    add_option(parser)
-    options = parser.parse_args()
+    options = parser_of(__doc__, "*").parse_args()
     torch.set_num_threads(1)
     manifest = load_manifest(options.data)
     settings = load_settings(PushingSettings, "pushing", manifest.preset, {})
