@@ -27,10 +27,10 @@ def probes(*places: tuple[float, float, float]) -> ContactPoints:
     return ContactPoints(positions, torch.zeros_like(positions), torch.ones(1, 1, len(places), dtype=torch.float64))
 
 
-def surface_of(statics, points, edge_reach=1.5, clearance=0.0):
+def surface_of(statics, points, edge_reach=1.5, clearance=0.0, workspace=None):
     mask = torch.ones_like(points.positions[..., 0], dtype=torch.bool)
     clearances = torch.full((1, 1), clearance, dtype=torch.float64)
-    return static_surface(statics, points.positions, mask, edge_reach, clearances)
+    return static_surface(statics, points.positions, mask, edge_reach, clearances, workspace)
 
 
 def static_contacts(surface, points, statics, far, center=None):
@@ -48,6 +48,18 @@ def test_a_surface_ends_where_it_was_seen_to_end() -> None:
     assert torch.allclose(endless.distances, torch.tensor([[0.1, 0.1, 0.1]]).double())
     assert torch.allclose(ended.distances, torch.tensor([[0.1, 0.1, FAR]]).double())
     assert ended.normals[0, 2].abs().max() == 0
+
+
+def test_it_goes_on_where_the_workspace_cuts_it() -> None:
+    corners = ((-2, -2, -1), (0.51, 2, 1))  # only the side towards +x cuts the table
+    workspace = tuple(torch.tensor([[corner]], dtype=torch.float64) for corner in corners)
+    statics, inside = table(), probes((0.2, 0.2, 0.1))
+    points = probes((0.2, 0.2, 0.1), (3.0, 0.2, 0.1), (-0.7, 0.2, 0.1), (0.2, 0.7, 0.1))
+    surface = surface_of(statics, inside, workspace=workspace)
+    found = static_contacts(surface, points, statics, FAR)
+    assert torch.allclose(found.distances, torch.tensor([[0.1, 0.1, FAR, FAR]]).double())
+    without = static_contacts(surface_of(statics, inside), points, statics, FAR)
+    assert torch.allclose(without.distances, torch.tensor([[0.1, FAR, FAR, FAR]]).double())
 
 
 def test_it_goes_on_under_a_body() -> None:

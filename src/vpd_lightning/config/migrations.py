@@ -43,6 +43,8 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "guess_hidden": False,
         "has_driven": False,
         "edge_reach": None,
+        "workspace_min": None,
+        "workspace_max": None,
         "supported_speed": 0.0,
         "skip_resting": False,
     },

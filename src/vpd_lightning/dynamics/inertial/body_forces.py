@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia
+from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, vectors_of
 from vpd_lightning.dynamics.inertial.contact import Contacts
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rotate
 
@@ -147,15 +147,16 @@ class BodyForces(nn.Module):
         motion: BodyMotion,
         inertia: Inertia,
     ) -> BodyMotion:
-        offsets = positions[:, None] - motion.centers[:, :, None]
-        pair = self.probe_query(probe)[:, None] + self.body_query(body)[:, :, None]
+        # A probe acts on the body that it belongs to alone: pairs with all others would be most of the work of a step.
+        own = share.argmax(dim=1)
+        offsets = positions - vectors_of(motion.centers, own)
+        pair = self.probe_query(probe) + vectors_of(self.body_query(body), own)
         pair = torch.relu(pair + self.offset_query(offsets / self.contact_range))
-        logits = self.attention(pair) + torch.log(share.clamp(min=1e-12))[..., None]
+        logits = self.attention(pair)[:, None] + torch.log(share.clamp(min=1e-12))[..., None]
         attention = torch.softmax(logits, dim=2)  # batch body probe force
         forces = self.residual_scale * torch.tanh(self.force(pair)).unflatten(-1, (self.num_forces, 3))
-        forces = attention[..., None] * forces
-        push = forces.sum(dim=(2, 3))
-        torque = cross(offsets, forces.sum(dim=3)).sum(dim=2)
+        push = torch.einsum("bapf,bpfi->bai", attention, forces)
+        torque = torch.einsum("bapf,bpfi->bai", attention, cross(offsets[:, :, None].expand_as(forces), forces))
         weight = self.residual_scale * torch.tanh(self.weight(body)) + self.common_acceleration()
         # Nearly one at initialisation; it may remove motion, never add any: a long rollout cannot feed on itself.
         keep = torch.sigmoid(self.damping(body) + 5.0)

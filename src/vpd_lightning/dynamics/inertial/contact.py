@@ -77,11 +77,13 @@ def nearest_static_contacts(
     static_normals: Float[Tensor, "batch particle 3"],
     static_mask: Bool[Tensor, "batch particle"],
     far: float,
+    reach: Float[Tensor, "batch particle"] | None = None,
 ) -> Contacts:
     """Measure each probe against the tangent plane of its nearest static particle whose normal is known.
 
     The point-to-plane distance is exact on flat surfaces however sparse the particles are. Without any static
-    particle, or beyond ``far`` metres, the distance is ``far`` and the normal zero: no contact.
+    particle, beyond ``far`` metres, or beside the nearest one by more than its ``reach`` (metres; null: without end),
+    the distance is ``far`` and the normal zero: no contact.
     """
     oriented = static_mask & (static_normals.square().sum(dim=-1) > 0.5)
     index, exists = nearest_usable(probes, static_positions, oriented)
@@ -89,6 +91,8 @@ def nearest_static_contacts(
     distances = (offsets * normals).sum(dim=-1)
     lateral = (offsets - distances[..., None] * normals).square().sum(dim=-1).clamp(min=1e-12).sqrt()
     known = exists & (offsets.square().sum(dim=-1) < far**2)
+    if reach is not None:
+        known = known & (lateral < torch.gather(reach, 1, index))
     return Contacts(
         distances=torch.where(known, distances, torch.full_like(distances, far)),
         normals=normals * known[..., None],

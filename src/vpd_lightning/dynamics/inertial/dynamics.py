@@ -15,11 +15,7 @@ from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia
 from vpd_lightning.dynamics.inertial.contact import Resolved
 from vpd_lightning.dynamics.inertial.contact_points import contact_points, pushed_surface
 from vpd_lightning.dynamics.inertial.contact_step import resolved_contacts
-from vpd_lightning.dynamics.inertial.driven_bodies import (
-    DrivenBodies,
-    driven_bodies,
-    is_pushed,
-)
+from vpd_lightning.dynamics.inertial.driven_bodies import DrivenBodies, driven_bodies, is_pushed
 from vpd_lightning.dynamics.inertial.first_motion import (
     arriving_motion,
     find_first_motion,
@@ -70,9 +66,10 @@ class InertialDynamics(AbstractDynamics):
     that is learned (``driven_bodies``); nothing pushes them.
 
     With ``edge_reach`` (spacings of the static particles) a static surface ends that far beside its last particle, and
-    goes on under bodies; null: it goes on without end. A body that approaches the surface under it by less than
-    ``supported_speed`` (in ``force_scale``, per step) when it is first seen stands on it, whatever of its foot was seen
-    (``static_surface``), and one that stands still does until something pushes it (``resting.held``).
+    goes on under bodies; null: it goes on without end, as it does beyond the sides of the workspace that cut it. A body
+    that approaches the surface under it by less than ``supported_speed`` (in ``force_scale``, per step) when it is
+    first seen stands on it, whatever of its foot was seen (``static_surface``), and one that stands still does until
+    something pushes it (``resting.held``).
 
     With ``num_contact_substeps`` contact is resolved in so many parts of a step (``SubstepSolver``); null: at once.
 
@@ -120,6 +117,8 @@ class InertialDynamics(AbstractDynamics):
         guess_hidden: bool,
         has_driven: bool,
         edge_reach: float | None,
+        workspace_min: Sequence[float] | None,
+        workspace_max: Sequence[float] | None,
         supported_speed: float,
         skip_resting: bool,
     ):
@@ -167,6 +166,7 @@ class InertialDynamics(AbstractDynamics):
                 f"got {edge_reach} and {supported_speed}"
             )
         self.edge_reach, self.supported_speed, self.skip_resting = edge_reach, supported_speed, skip_resting
+        self.workspace = None if workspace_min is None or workspace_max is None else (workspace_min, workspace_max)
         self.has_driven = has_driven
         self.log_driven_friction = nn.Parameter(torch.tensor(math.log(0.3))) if has_driven else None
         self.static_shading = None
@@ -254,6 +254,7 @@ class InertialDynamics(AbstractDynamics):
             rest_speed=self.rest_share * self.force_scale,
             arm=_ARM * self.contact_range,
             edge_reach=self.edge_reach,
+            workspace=self.workspace,
             far=self.contact_reach,
         )
 

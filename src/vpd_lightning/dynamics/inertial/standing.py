@@ -1,5 +1,6 @@
 """What bodies stand on when they are first seen: surfaces with edges, also where hidden, and who rests there."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -26,12 +27,14 @@ def standing(
     rest_speed: float,
     arm: float,
     edge_reach: float | None,
+    workspace: tuple[Sequence[float], Sequence[float]] | None,
     far: float,
 ) -> InertialMemory:
     """Return the memory with what of the static surface is hidden, where it ends, and which bodies rest on it.
 
     ``positions`` are those of the moving candidates and ``statics`` positions, normals and mask of what stands still,
     from the memory's origin; lengths in metres, speeds in metres per step. ``arm`` is at which a spin counts.
+    ``workspace`` is its lowest and highest corner in the world.
     """
     above, is_above = positions.detach(), memory.mask
     if driven is not None:
@@ -51,7 +54,11 @@ def standing(
             undisturbed=undisturbed,
             at_rest=memory.at_rest | undisturbed,
         )
-    return replace(memory, surface=static_surface(statics, above, is_above, edge_reach, clearances))
+    walls = None
+    if workspace is not None:
+        low, high = (memory.origin.new_tensor(list(corner)) - memory.origin for corner in workspace)
+        walls = low, high
+    return replace(memory, surface=static_surface(statics, above, is_above, edge_reach, clearances, walls))
 
 
 def may_be_hidden(

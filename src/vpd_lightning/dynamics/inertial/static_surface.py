@@ -13,6 +13,9 @@ from vpd_lightning.geometry.spacing import point_spacing
 _BEHIND = 0.005
 """Metres by which a seen point may be behind a tangent plane that it is above: noise of the plane."""
 
+_AT_WALL = 2.0
+"""Of its reach: how near to the side of the workspace a surface is cut by it, and goes on unseen."""
+
 _NUM_NEIGHBOURS, _NUM_AGREEING, _AGREEMENT = 8, 4, 0.9
 """A normal is trusted that so many of the nearest particles share, to this cosine."""
 
@@ -25,14 +28,15 @@ class StaticSurface:
     """Points of what stands still that no camera saw, and how far a seen one reaches; lengths in metres.
 
     ``positions`` are the footprints of bodies: what lies under them on the surface below. ``reach`` is how far beside a
-    point its surface goes on (infinite: it has no edge). ``clearances`` are how far above their surface (below it,
-    where negative) the points of resting bodies seem to end.
+    point, of the static particles and then of the footprints, its surface goes on (infinite: it has no edge there);
+    None: no surface has an edge. ``clearances`` are how far above their surface (below it, where negative) the points
+    of resting bodies seem to end.
     """
 
     positions: Float[Tensor, "batch footprint 3"]
     normals: Float[Tensor, "batch footprint 3"]
     mask: Bool[Tensor, "batch footprint"]
-    reach: Float[Tensor, " batch"]
+    reach: Float[Tensor, "batch static_and_footprint"] | None
     clearances: Float[Tensor, "batch body"]
 
 
@@ -63,28 +67,35 @@ def static_surface(
     is_above: Bool[Tensor, "batch point"],
     edge_reach: float | None,
     clearances: Float[Tensor, "batch body"],
+    workspace: tuple[Tensor, Tensor] | None = None,
 ) -> StaticSurface:
     """Return what contact needs beside the static particles (positions, normals, mask).
 
     ``above`` are points of what hides the surface below it: bodies, and what is driven. Each is projected on the
     tangent plane of the static particle nearest to it, of those whose plane it is not behind: what is seen is outside
     of everything, and near a table's edge the nearest particle may be on the table's side. ``edge_reach`` is in
-    spacings of the static particles; null: a surface goes on without end, and there are no footprints.
+    spacings of the static particles; null: a surface goes on without end, and there are no footprints. Where
+    the sides of the ``workspace`` (its lowest and highest corner, ``batch 1 3``) cut a surface, it goes on beyond them.
     """
     positions, normals, mask = statics
     if edge_reach is None:
         nothing = above[:, :0], above[:, :0], is_above[:, :0]
-        return StaticSurface(*nothing, torch.full_like(above[:, 0, 0], torch.inf), clearances)
+        return StaticSurface(*nothing, None, clearances)
     oriented = mask & (normals.square().sum(dim=-1) > 0.5)
     index, exists = _nearest_below(above, positions, normals, oriented)
     facing = vectors_of(normals, index)
     heights = ((above - vectors_of(positions, index)) * facing).sum(dim=-1, keepdim=True)
     known = exists & is_above
+    reach = (edge_reach * point_spacing(positions, mask))[:, None].expand(-1, positions.shape[1] + above.shape[1])
+    if workspace is not None:
+        to_wall = torch.minimum(positions - workspace[0], workspace[1] - positions).amin(dim=-1)
+        is_cut = torch.nn.functional.pad(to_wall < _AT_WALL * reach[:, :1], (0, above.shape[1]))
+        reach = reach.masked_fill(is_cut, torch.inf)
     return StaticSurface(
         positions=torch.where(known[..., None], above - heights * facing, 0.0),
         normals=torch.where(known[..., None], facing, 0.0),
         mask=known,
-        reach=edge_reach * point_spacing(positions, mask),
+        reach=reach,
         clearances=clearances,
     )
 
@@ -118,9 +129,10 @@ def static_contacts(
     """
     parts = zip(statics, (surface.positions, surface.normals, surface.mask), strict=True)
     joined = [torch.cat(part, dim=1) for part in parts] if surface.mask.shape[1] else list(statics)
-    found = nearest_static_contacts(points.positions, joined[0], joined[1], joined[2], far)
-    is_on = found.lateral < surface.reach[:, None]
-    is_on = is_on & (_in_front(found, points, centers) | torch.isinf(surface.reach)[:, None])
+    found = nearest_static_contacts(points.positions, joined[0], joined[1], joined[2], far, surface.reach)
+    is_on = torch.ones_like(found.distances, dtype=torch.bool)
+    if surface.reach is not None:
+        is_on = _in_front(found, points, centers)
     lowered = found.distances - torch.gather(surface.clearances, 1, points.bodies)
     # Without a surface near, the distance is the farthest there is.
     known = found.normals.square().sum(dim=-1) > 0.5
