@@ -27,9 +27,11 @@ def _moved(value: Any, *args: Any, **kwargs: Any) -> Any:
 
 
 def mapped_tensors(function: Callable[..., Tensor], tree: Any, *others: Any) -> Any:
-    """Apply a function to every tensor of a dataclass of tensors, however deep, with those of others at its place."""
+    """Apply a function to each tensor of dataclasses and tuples, however deep, with those of others at its place."""
     if isinstance(tree, Tensor):
         return function(tree, *others)
+    if isinstance(tree, tuple):
+        return tuple(mapped_tensors(function, *parts) for parts in zip(tree, *others, strict=True))
     if not is_dataclass(tree) or isinstance(tree, type):
         return tree
     names = [item.name for item in fields(tree)]

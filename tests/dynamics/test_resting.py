@@ -154,6 +154,7 @@ def test_rows_are_taken_and_put_back() -> None:
     some = rows_of(driven, rows, 3)
     assert len(some.positions) == 2 and torch.equal(some.groups, driven.groups[rows])
     changed = replace(some, positions=some.positions + 1.0)
-    back = with_rows(driven, rows, changed, 3)
+    back = with_rows(driven, rows, some, changed, 3)
+    assert back.normals is driven.normals  # it was not changed
     assert torch.equal(back.positions[1], driven.positions[1]) and torch.equal(back.positions[rows], changed.positions)
     assert back.features is None

@@ -124,6 +124,18 @@ def nearest_body_contacts(
 
 
 @dataclass(frozen=True)
+class _Facing:
+    """The points that may touch another body, and those there: most points of a step have none, and are left out."""
+
+    own: Int[Tensor, "batch near"]
+    offsets: Float[Tensor, "batch near 3"]
+    other: Int[Tensor, "batch near"]  # the other body
+    other_offsets: Float[Tensor, "batch near 3"]
+    other_normals: Float[Tensor, "batch near 3"]
+    usable: Bool[Tensor, "batch body body near"]
+
+
+@dataclass(frozen=True)
 class Pairs:
     """One contact of every ordered pair of bodies; those that do not touch are inactive."""
 
@@ -196,9 +208,10 @@ class ContactSolver:
         motion, touches = free, []
         touching = torch.zeros_like(self.masses, dtype=torch.bool)
         pairs: list[Pairs] = []
+        facing = None if between is None else self._facing(between)
         for _ in range(num_iterations):
-            if between is not None:
-                motion, pair = self._part(motion, free, between)
+            if facing is not None:
+                motion, pair = self._part(motion, free, facing)
                 pairs.append(pair)
                 touching = touching | pair.touching
             motion, touch = self._lift(motion, free, static, touchable)
@@ -252,46 +265,55 @@ class ContactSolver:
         lift = torch.relu(wanted - speed) / self.inertia.response(touch.arms, touch.normals)
         return motion.pushed(self.inertia.push(touch.arms, lift * touch.is_active * touch.normals))
 
+    def _facing(self, contacts: BodyContacts) -> _Facing:
+        """Gather the points that may touch another body, packed to the largest count of the batch (at least one)."""
+        count = max(1, int(contacts.known.sum(dim=1).max()))
+        index = contacts.known.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :count]
+        known, there = torch.gather(contacts.known, 1, index), torch.gather(contacts.other, 1, index)
+        own, other = torch.gather(self.own, 1, index), torch.gather(self.own, 1, there)
+        bodies = torch.arange(self.points.members.shape[1], device=own.device)
+        from_first = own[:, None, None] == bodies[:, None, None]
+        to_second = other[:, None, None] == bodies[:, None]
+        offsets, other_offsets = vectors_of(self.offsets, index), vectors_of(self.offsets, there)
+        normals = vectors_of(self.points.normals, there)
+        return _Facing(own, offsets, other, other_offsets, normals, known[:, None, None] & from_first & to_second)
+
     def _pairs(
-        self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts
+        self, motion: BodyMotion, free: BodyMotion, near: _Facing
     ) -> tuple[Pairs, Float[Tensor, "batch pair 1"]]:
         """Return the deepest contact of each pair of bodies after a motion, and how deep it is (metres)."""
-        own, turned = self.own, motion.turned(self.offsets, self.own)
-        there = vectors_of(motion.centers + motion.displacements, own) + turned
-        facing = rotate(matrices_of(rotation_from_spin(motion.spins), own), self.points.normals)
-        facing = vectors_of(facing, contacts.other)
-        gaps = ((there - vectors_of(there, contacts.other)) * facing).sum(dim=-1)
-        count = self.points.members.shape[1]
-        bodies = torch.arange(count, device=own.device)
-        from_first = own[:, None, None] == bodies[:, None, None]
-        to_second = torch.gather(own, 1, contacts.other)[:, None, None] == bodies[:, None]
-        usable = contacts.known[:, None, None] & from_first & to_second  # batch body body probe
+        middles = motion.centers + motion.displacements
+        here = vectors_of(middles, near.own) + motion.turned(near.offsets, near.own)
+        there = vectors_of(middles, near.other) + motion.turned(near.other_offsets, near.other)
+        facing = rotate(matrices_of(rotation_from_spin(motion.spins), near.other), near.other_normals)
+        gaps = ((here - there) * facing).sum(dim=-1)
+        count, usable = self.points.members.shape[1], near.usable
+        bodies = torch.arange(count, device=gaps.device)
         deepest, probe = gaps[:, None, None].expand(usable.shape).masked_fill(~usable, torch.inf).min(dim=-1)
         depth, probe = torch.relu(-deepest).flatten(1)[..., None], probe.flatten(1)
         first, second = (
-            index.expand(len(own), -1) for index in (bodies.repeat_interleave(count), bodies.repeat(count))
+            index.expand(len(gaps), -1) for index in (bodies.repeat_interleave(count), bodies.repeat(count))
         )
         # Both bodies are pushed at one place, between the two points: at two, they would be turned out of nothing.
-        place = (vectors_of(there, probe) + vectors_of(there, torch.gather(contacts.other, 1, probe))) / 2
+        place = (vectors_of(here, probe) + vectors_of(there, probe)) / 2
         normals = vectors_of(facing, probe)
         if self.num_driven:
-            middles = (there + vectors_of(there, contacts.other)) / 2
-            place, normals = self._spread(place, normals, middles, facing, torch.where(usable, -gaps[:, None, None], 0))
-        centers = motion.centers + motion.displacements
+            between = (here + there) / 2
+            place, normals = self._spread(place, normals, between, facing, torch.where(usable, -gaps[:, None, None], 0))
         pairs = Pairs(
             first=first,
             second=second,
-            first_arms=place - vectors_of(centers, first),
-            second_arms=place - vectors_of(centers, second),
+            first_arms=place - vectors_of(middles, first),
+            second_arms=place - vectors_of(middles, second),
             normals=normals,
             approach=torch.zeros_like(depth),
             is_active=depth > 0,
         )
         return replace(pairs, approach=-(pairs.relative(free) * pairs.normals).sum(dim=-1, keepdim=True)), depth
 
-    def _part(self, motion: BodyMotion, free: BodyMotion, contacts: BodyContacts) -> tuple[BodyMotion, Pairs]:
+    def _part(self, motion: BodyMotion, free: BodyMotion, near: _Facing) -> tuple[BodyMotion, Pairs]:
         """Push apart each pair of bodies at its deepest contact, half as far as needed from either side."""
-        pairs, depth = self._pairs(motion, free, contacts)
+        pairs, depth = self._pairs(motion, free, near)
         impulse = 0.5 * depth / self._pair_response(pairs, pairs.normals)
         sliding = pairs.relative(motion)
         sliding = sliding - (sliding * pairs.normals).sum(dim=-1, keepdim=True) * pairs.normals

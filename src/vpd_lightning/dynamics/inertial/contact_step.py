@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia
@@ -11,6 +11,8 @@ from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, Con
 from vpd_lightning.dynamics.inertial.contact_points import between_bodies, pushed_surface
 from vpd_lightning.dynamics.inertial.driven_bodies import (
     DrivenBodies,
+    driven_bodies,
+    is_pushed,
     joined_inertia,
     joined_materials,
     joined_motion,
@@ -18,6 +20,15 @@ from vpd_lightning.dynamics.inertial.driven_bodies import (
 )
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
 from vpd_lightning.dynamics.inertial.substeps import SubstepSolver
+from vpd_lightning.types import Driven
+
+
+def about_to_be_pushed(
+    driven: Driven, positions: Float[Tensor, "batch moving 3"], memory: InertialMemory, *, is_mirrored: bool
+) -> Bool[Tensor, " batch"]:
+    """Return in which members what is driven comes near a body in this step."""
+    surface = pushed_surface(positions, memory, is_mirrored)
+    return is_pushed(driven_bodies(driven, memory.origin), surface, memory.motion)
 
 
 def resolved_contacts(

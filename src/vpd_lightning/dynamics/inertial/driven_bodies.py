@@ -10,6 +10,7 @@ from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, vec
 from vpd_lightning.dynamics.inertial.contact import BodyContacts, ContactPoints, Contacts
 from vpd_lightning.dynamics.inertial.materials import Materials
 from vpd_lightning.dynamics.inertial.nearest import nearest_usable
+from vpd_lightning.dynamics.inertial.resting import rows_of
 from vpd_lightning.dynamics.inertial.rigid_motion import fit_twists, weighted_sum
 from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.types import Driven
@@ -179,8 +180,42 @@ def _met_by_driven(
 ) -> tuple[Tensor, Tensor]:
     """Return the surface point whose tangent plane each driven point meets, and whether it meets one in this step.
 
-    With a ``margin`` (spacings of the driven points) it is enough to come that near.
+    With a ``margin`` (spacings of the driven points) it is enough to come that near. Members of the batch whose boxes
+    are farther apart than that are not looked at.
     """
+    target, is_met = torch.zeros_like(bodies.groups), torch.zeros_like(bodies.mask)
+    count = len(is_met)
+    rows = _may_meet(bodies, surface, motion, margin).nonzero()[:, 0]
+    if len(rows) == 0:
+        return target, is_met
+    if len(rows) == count:
+        return _met_nearby(bodies, surface, motion, margin)
+    found = _met_nearby(*rows_of((bodies, surface, motion), rows, count), margin)
+    return target.index_copy(0, rows, found[0]), is_met.index_copy(0, rows, found[1])
+
+
+def _may_meet(bodies: DrivenBodies, surface: Surface, motion: BodyMotion, margin: float) -> Bool[Tensor, " batch"]:
+    """Return in which members the boxes around both, swept in the step, are as near as points must be to meet."""
+    farthest = torch.maximum(margin * bodies.spacing, surface.sizes.amax(dim=1) / 3)
+    reach = (_REACH * surface.spacing + margin * bodies.spacing + farthest)[:, None]
+    there = motion.carried(surface.positions, surface.own)
+    low, high = _box(torch.cat([surface.positions, there], dim=1), surface.is_usable.repeat(1, 2))
+    moved = torch.cat([bodies.positions, bodies.positions + bodies.displacements], dim=1)
+    driven_low, driven_high = _box(moved, bodies.mask.repeat(1, 2))
+    apart = torch.maximum(low - driven_high, driven_low - high)
+    return (apart <= reach).all(dim=-1)
+
+
+def _box(positions: Tensor, mask: Tensor) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"]]:
+    missing = ~mask[..., None]
+    return (
+        positions.masked_fill(missing, torch.inf).amin(dim=1),
+        positions.masked_fill(missing, -torch.inf).amax(dim=1),
+    )
+
+
+def _met_nearby(bodies: DrivenBodies, surface: Surface, motion: BodyMotion, margin: float) -> tuple[Tensor, Tensor]:
+    """Look at every pair; see ``_met_by_driven``."""
     moves = motion.carried(surface.positions, surface.own) - surface.positions
     # Each member has a number of parts of its own: a batch equals its members.
     fastest = bodies.displacements.norm(dim=-1).amax(dim=1) + (moves.norm(dim=-1) * surface.is_usable).amax(dim=1)

@@ -13,9 +13,9 @@ from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.inertial.body_forces import BodyForces
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, body_volumes, matrices_of, vectors_of
 from vpd_lightning.dynamics.inertial.contact import Resolved
-from vpd_lightning.dynamics.inertial.contact_points import contact_points, pushed_surface
-from vpd_lightning.dynamics.inertial.contact_step import resolved_contacts
-from vpd_lightning.dynamics.inertial.driven_bodies import DrivenBodies, driven_bodies, is_pushed
+from vpd_lightning.dynamics.inertial.contact_points import contact_points
+from vpd_lightning.dynamics.inertial.contact_step import about_to_be_pushed, resolved_contacts
+from vpd_lightning.dynamics.inertial.driven_bodies import DrivenBodies, driven_bodies
 from vpd_lightning.dynamics.inertial.first_motion import (
     arriving_motion,
     find_first_motion,
@@ -276,8 +276,7 @@ class InertialDynamics(AbstractDynamics):
         if current.num_particles == 0:
             return current, memory
         current = current.without_padding()
-        device_type = current.positions.device.type
-        with torch.autocast(device_type, enabled=False):  # geometry in full precision
+        with torch.autocast(current.positions.device.type, enabled=False):  # geometry in full precision
             if not self.carry_memory and rollout_step > 0:
                 memory = self._first_memory(*observed(previous, current))
             if not self.skip_resting or torch.is_grad_enabled():
@@ -290,15 +289,16 @@ class InertialDynamics(AbstractDynamics):
         driven = current.driven if self.has_driven else None
         if driven is not None and bool(is_idle.any()):
             positions = take(current.positions, memory.index) - memory.origin
-            surface = pushed_surface(positions, memory, self.mirror_hidden)
-            is_idle = is_idle & ~is_pushed(driven_bodies(driven, memory.origin), surface, memory.motion)
+            idle = is_idle.nonzero()[:, 0]
+            parts = rows_of((driven, positions, memory), idle, count)
+            is_idle = is_idle.index_put((idle,), ~about_to_be_pushed(*parts, is_mirrored=self.mirror_hidden))
         if not bool(is_idle.any()) or self.hidden_guess is not None and current.hidden_side is None:
             return self._step(current, memory)  # also where there are no hidden sides yet to keep
         rows = (~is_idle).nonzero()[:, 0]
         if len(rows) == 0:
             return current, memory
-        moved = self._step(rows_of(current, rows, count), rows_of(memory, rows, count))
-        return with_rows(current, rows, moved[0], count), with_rows(memory, rows, moved[1], count)
+        some = rows_of((current, memory), rows, count)
+        return with_rows((current, memory), rows, some, self._step(*some), count)
 
     def _is_slow(self, motion: BodyMotion) -> Bool[Tensor, "batch body"]:
         return is_slow(motion, self.rest_share * self.force_scale, _ARM * self.contact_range)

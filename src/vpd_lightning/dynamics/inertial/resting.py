@@ -56,18 +56,28 @@ def rows_of(tree: Tree, rows: Int64[Tensor, " row"], count: int) -> Tree:
     """Return some members of tensors and dataclasses of tensors whose batch axis has ``count`` members."""
 
     def taken(values: Tensor) -> Tensor:
-        return values.index_select(0, rows) if values.dim() and len(values) == count else values
+        if not values.dim() or len(values) != count:
+            return values
+        if values.stride(0) == 0:  # one for all, which no copy is needed of
+            return values[:1].expand(len(rows), *values.shape[1:])
+        return values.index_select(0, rows)
 
     return mapped_tensors(taken, tree)  # type: ignore[no-any-return]
 
 
-def with_rows(tree: Tree, rows: Int64[Tensor, " row"], new: Tree, count: int) -> Tree:
-    """Return the members of ``tree`` with those at ``rows`` replaced by those of ``new``."""
+def with_rows(tree: Tree, rows: Int64[Tensor, " row"], old: Tree, new: Tree, count: int) -> Tree:
+    """Return the members of ``tree`` with those at ``rows`` replaced by ``new``, made of ``old`` (``rows_of``).
 
-    def put(values: Tensor, other: Tensor) -> Tensor:
-        return values.index_copy(0, rows, other.to(values.dtype)) if values.dim() and len(values) == count else values
+    Tensors that ``new`` has from ``old`` stay what they are: most describe what stands still, and copies of them took
+    longer than a step.
+    """
 
-    return mapped_tensors(put, tree, new)  # type: ignore[no-any-return]
+    def put(values: Tensor, before: Tensor, after: Tensor) -> Tensor:
+        if after is before or not values.dim() or len(values) != count:
+            return values
+        return values.index_copy(0, rows, after.to(values.dtype))
+
+    return mapped_tensors(put, tree, old, new)  # type: ignore[no-any-return]
 
 
 def members_in_use(bodies: Float[Tensor, "batch body moving"]) -> Bool[Tensor, "batch body"]:

@@ -39,14 +39,15 @@ class SubstepSolver(ContactSolver):
         """Return the step; ``before`` is the velocity with which bodies came, ``free`` that after all forces."""
         touchable = self._touchable(static, max_depth)
         share = 1.0 / num_substeps
+        facing = None if between is None else self._facing(between)
         done = _scaled(free, 0.0)
         forces = as_push(_scaled(free.pushed(as_push(_scaled(before, -1.0))), share))
         velocity, touching = before, torch.zeros_like(self.masses, dtype=torch.bool)
         for _ in range(num_substeps):
             velocity = velocity.pushed(forces)
-            if between is not None:
+            if facing is not None:
                 trial = _moved(done, velocity, share)
-                pairs, depth = self._pairs(trial, velocity, between)
+                pairs, depth = self._pairs(trial, velocity, facing)
                 changed = self._hit_apart(velocity, pairs)
                 closing = (pairs.relative(changed) - pairs.relative(velocity)) * pairs.normals
                 left = torch.relu(depth - share * closing.sum(dim=-1, keepdim=True))
