@@ -249,15 +249,15 @@ def test_a_spin_is_turned_with_its_body_and_a_stretch_with_it():
     assert torch.allclose(following[0, 0], rotation @ stretch @ rotation.T, atol=1e-12)
 
 
-def network(is_soft):
-    return MaterialNetwork(feature_dim=5, hidden_dim=8, is_soft=is_soft).double()
+def network(is_soft, max_friction=None):
+    return MaterialNetwork(feature_dim=5, hidden_dim=8, is_soft=is_soft, max_friction=max_friction).double()
 
 
-@pytest.mark.parametrize("is_soft", [True, False])
-def test_before_training_all_bodies_are_of_one_material(is_soft):
+@pytest.mark.parametrize(("is_soft", "max_friction"), [(True, None), (False, None), (False, 1.0)])
+def test_before_training_all_bodies_are_of_one_material(is_soft, max_friction):
     features = torch.randn(2, 9, 5, dtype=torch.float64)
     shares = torch.rand(2, 3, 9, dtype=torch.float64)
-    made = network(is_soft)(features, shares / shares.sum(dim=-1, keepdim=True))
+    made = network(is_soft, max_friction)(features, shares / shares.sum(dim=-1, keepdim=True))
 
     expected = {"friction": 0.5, "restitution": 0.1, "density": 1.0, "softness": 0.01 * is_soft}
     for name, value in (expected | {"stiffness": 0.25, "damping": 0.1}).items():
@@ -266,8 +266,14 @@ def test_before_training_all_bodies_are_of_one_material(is_soft):
         assert torch.allclose(values, torch.full_like(values, value), atol=1e-7), name  # the bias is of float32
 
 
-def test_materials_stay_within_their_ranges_and_rigid_is_exactly_rigid():
-    model = network(is_soft=False)
+def test_a_limit_of_friction_below_that_of_the_start_is_refused():
+    with pytest.raises(ValueError, match=r"max_friction must be more than 0\.5 or null, got 0\.4"):
+        network(is_soft=False, max_friction=0.4)
+
+
+@pytest.mark.parametrize(("max_friction", "most_friction"), [(None, math.exp(2)), (1.0, 1.0)])
+def test_materials_stay_within_their_ranges_and_rigid_is_exactly_rigid(max_friction, most_friction):
+    model = network(is_soft=False, max_friction=max_friction)
     torch.nn.init.normal_(model.network[-1].weight, std=100.0)
     features = 50 * torch.randn(4, 30, 5, dtype=torch.float64)
     made = model(features, torch.eye(30, dtype=torch.float64).expand(4, -1, -1))
@@ -276,7 +282,7 @@ def test_materials_stay_within_their_ranges_and_rigid_is_exactly_rigid():
     for name in ("restitution", "stiffness", "damping"):
         values = getattr(made, name)
         assert ((values >= 0) & (values <= 1)).all() and values.max() > 0.5 > values.min(), name
-    for name, top in (("friction", math.exp(2)), ("density", math.exp(3))):
+    for name, top in (("friction", most_friction), ("density", math.exp(3))):
         assert getattr(made, name).max() <= top * (1 + 1e-12) and getattr(made, name).min() > 0, name
 
 

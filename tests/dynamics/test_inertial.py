@@ -33,6 +33,7 @@ SETTINGS = {
     "max_contact_depth": 0.06,
     "mirror_hidden": True,
     "is_soft": False,
+    "max_friction": None,
     "rest_share": 0.05,
     "keep_shape": True,
     "carry_memory": True,

@@ -114,7 +114,7 @@ def table_with_a_side(slanted: bool = False) -> tuple[torch.Tensor, torch.Tensor
 def test_a_side_pushes_what_is_beside_it_and_not_what_stands_on_top() -> None:
     statics = table_with_a_side()
     nothing = replace(surface_of(statics, probes((-0.3, 0.0, 0.1))), mask=torch.zeros(1, 1, dtype=torch.bool))
-    low = probes((-0.01, 0.0, -0.03))  # its nearest particle is on the side
+    low = probes((-0.01, 0.0, -0.04))  # its nearest particle is on the side
     on_top = static_contacts(nothing, low, statics, FAR, center=(-0.1, 0.0, 0.05))
     beside = static_contacts(nothing, low, statics, FAR, center=(0.05, 0.0, -0.1))
     assert on_top.distances.item() == FAR and not on_top.normals.any()
@@ -123,7 +123,7 @@ def test_a_side_pushes_what_is_beside_it_and_not_what_stands_on_top() -> None:
 
 def test_footprints_near_an_edge_are_on_the_top() -> None:
     statics = table_with_a_side()
-    body = probes((-0.01, 0.02, 0.005), (-0.02, 0.0, 0.03))
+    body = probes((-0.04, 0.02, 0.005), (-0.045, 0.0, 0.03))
     found = surface_of(statics, body)
     assert found.mask.all() and torch.allclose(found.positions[..., 2], torch.zeros(1, 2).double(), atol=1e-12)
 

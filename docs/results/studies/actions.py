@@ -5,7 +5,8 @@ checkpoint on bodies whose true centre moves by more than ``MOVED`` within 16 st
 given the true motion (``true``), that of another clip, carried to where the pusher is (``shuffled``), and none
 (``still``: the pusher stays). Errors are those of ``vpd-eval``: of the centre in centimetres, of the orientation in
 degrees, by horizon; beside them what needs no model (a constant displacement means nothing where bodies are pushed
-any way). Intervals: 2,000 resamples of trajectories.
+any way). ``psnr_moving`` is of pictures of the first camera (dB, over moving pixels), beside the last input frame
+(``copy``) and the mean of the training pictures. Intervals: 2,000 resamples of trajectories.
 """
 
 import json
@@ -20,16 +21,22 @@ from numpy.typing import NDArray
 
 from docs.results.studies.changed_dynamics import change_dynamics, parser_of
 from vpd_lightning.data.clip import Clip, read_clip
+from vpd_lightning.evaluation.images import as_float, moving_pixels
 from vpd_lightning.evaluation.motion import clip_motion, trajectory_of
-from vpd_lightning.evaluation.prediction import encode_clip, roll_out_clip, takes_actions
+from vpd_lightning.evaluation.prediction import encode_clip, render_steps, roll_out_clip, takes_actions
+from vpd_lightning.evaluation.protocol import Protocol
+from vpd_lightning.evaluation.references import training_mean
 from vpd_lightning.files import AtomicPath
 from vpd_lightning.loading import LoadedModel, load_model
-from vpd_lightning.types import Driven
+from vpd_lightning.metrics.psnr import psnr_of_moving_pixels
+from vpd_lightning.metrics.true_images import TrueImages
+from vpd_lightning.types import Driven, Particles
 
 STEPS = (1, 2, 4, 8, 16, 32)
 MOVED = 0.01  # metres
 TOUCHED_WITHIN = 16  # steps
 REFERENCES = {"nothing moves": "copy", "true velocity": "velocity"}
+CAMERA = 0
 _NUM_RESAMPLES = 2000
 
 
@@ -55,9 +62,27 @@ def _with_positions(clip: Clip, context: Driven, positions: torch.Tensor) -> Cli
     return replace(clip, driven=replace(clip.driven, positions=torch.cat([context.positions, positions])))
 
 
+def pictures(model: LoadedModel, clip: Clip, states: Sequence[Particles]) -> torch.Tensor:
+    """Return what one camera would see after ``STEPS`` (step, 1, height, width, 3), colours in [0, 1]."""
+    at = [step - 1 for step in STEPS]
+    cameras = clip.target_cameras[at][:, [CAMERA]]
+    return render_steps(model.simulator, [states[step] for step in at], cameras).float().cpu().nan_to_num(0.0)
+
+
+def true_pictures(model: LoadedModel, clip: Clip) -> TrueImages:
+    """Return what it did see, and which pixels moved."""
+    protocol = Protocol(**model.config["protocol"])
+    at = [step - 1 for step in STEPS]
+    colors, moving = as_float(clip.target_rgb)[at], moving_pixels(clip, protocol)[at]
+    return TrueImages(colors[:, [CAMERA]], moving[:, [CAMERA]], protocol.min_moving_pixels)
+
+
 def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) -> dict[str, Any]:
     """Return the errors of one model with each kind of action."""
     margin = model.config["protocol"]["body_margin"]
+    mean = training_mean(sorted((data / "train").glob("*.h5")))[None, [CAMERA]]
+    scores: dict[str, list[NDArray[np.float64]]] = {}
+    clip_of: list[int] = []
     files = sorted((data / split).glob("*.h5"))
     rows: dict[str, list[NDArray[np.float64]]] = {}
     trajectory: list[int] = []
@@ -71,14 +96,22 @@ def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) 
                 if not bool(touched.any()):
                     continue
                 scene = encode_clip(model.simulator, clip, model.input_views)
+                seen, clip_of = true_pictures(model, clip), [*clip_of, number]
+                shown_as = {"copy": as_float(clip.rgb[-1:])[:, [CAMERA]], "mean image": mean}
                 for name, shown in variants(model, clip, other).items():
                     states = roll_out_clip(model.simulator, scene, shown, max(STEPS))
                     motion, _ = clip_motion(clip, trajectory_of(scene.current, states), margin, None)
                     keep = touched[: len(motion["centroid_error"])]
                     for metric, values in motion.items():
                         rows.setdefault(f"{name}/{metric}", []).append(values[keep].numpy())
+                    shown_as[name] = pictures(model, clip, states)
+                for name, colors in shown_as.items():
+                    scores.setdefault(name, []).append(psnr_of_moving_pixels(colors, seen)["psnr_moving"].mT.numpy())
                 trajectory += [number] * int(keep.sum())
     found = _summary({name: np.concatenate(values) for name, values in rows.items()}, np.array(trajectory))
+    found["psnr_moving"] = {
+        name: _means(np.concatenate(values), np.array(clip_of)) for name, values in sorted(scores.items())
+    }
     parameters = sum(values.numel() for values in model.simulator.parameters())
     return {**found, "updates": model.step, "parameters": parameters, "starts": list(starts)}
 
@@ -139,6 +172,9 @@ def print_table(name: str, found: dict[str, Any]) -> None:
         if isinstance(part, dict) and "centroid_error" in part
     }
     for kind, row in {**parts, **found["references"]}.items():
+        print(f"  {kind:14}", " ".join(f"{row[str(step)][0]:6.2f}" for step in STEPS))
+    print("  moving PSNR of its pictures, dB")
+    for kind, row in found["psnr_moving"].items():
         print(f"  {kind:14}", " ".join(f"{row[str(step)][0]:6.2f}" for step in STEPS))
 
 

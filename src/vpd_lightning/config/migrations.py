@@ -42,6 +42,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "num_contact_substeps": None,
         "guess_hidden": False,
         "has_driven": False,
+        "max_friction": None,
         "edge_reach": None,
         "workspace_min": None,
         "workspace_max": None,

@@ -11,6 +11,7 @@ from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, Pus
 from vpd_lightning.dynamics.inertial.materials import Materials
 from vpd_lightning.dynamics.inertial.nearest import nearest_usable
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rotate, rotation_from_spin
+from vpd_lightning.dynamics.inertial.surface_edges import SurfaceEdges
 
 
 @dataclass(frozen=True)
@@ -77,13 +78,13 @@ def nearest_static_contacts(
     static_normals: Float[Tensor, "batch particle 3"],
     static_mask: Bool[Tensor, "batch particle"],
     far: float,
-    reach: Float[Tensor, "batch particle"] | None = None,
+    edges: SurfaceEdges | None = None,
 ) -> Contacts:
     """Measure each probe against the tangent plane of its nearest static particle whose normal is known.
 
     The point-to-plane distance is exact on flat surfaces however sparse the particles are. Without any static
-    particle, beyond ``far`` metres, or beside the nearest one by more than its ``reach`` (metres; null: without end),
-    the distance is ``far`` and the normal zero: no contact.
+    particle, beyond ``far`` metres, or beside the nearest one's surface where that ends (``edges``; None: nowhere), the
+    distance is ``far`` and the normal zero: no contact.
     """
     oriented = static_mask & (static_normals.square().sum(dim=-1) > 0.5)
     index, exists = nearest_usable(probes, static_positions, oriented)
@@ -91,8 +92,8 @@ def nearest_static_contacts(
     distances = (offsets * normals).sum(dim=-1)
     lateral = (offsets - distances[..., None] * normals).square().sum(dim=-1).clamp(min=1e-12).sqrt()
     known = exists & (offsets.square().sum(dim=-1) < far**2)
-    if reach is not None:
-        known = known & (lateral < torch.gather(reach, 1, index))
+    if edges is not None:
+        known = known & edges.gathered(index).include(offsets, lateral)
     return Contacts(
         distances=torch.where(known, distances, torch.full_like(distances, far)),
         normals=normals * known[..., None],

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool
 from torch import Tensor, nn
 
 from vpd_lightning.dynamics.base import AbstractDynamics
@@ -109,6 +108,7 @@ class InertialDynamics(AbstractDynamics):
         max_contact_depth: float,
         mirror_hidden: bool,
         is_soft: bool,
+        max_friction: float | None,
         rest_share: float,
         keep_shape: bool,
         carry_memory: bool,
@@ -156,8 +156,9 @@ class InertialDynamics(AbstractDynamics):
             acceleration_gain=acceleration_gain,
             contact_range=contact_range,
         )
-        self.materials = MaterialNetwork(feature_dim=feature_dim, hidden_dim=hidden_dim, is_soft=is_soft)
-        self.moving_shading = MovingShading(feature_dim=feature_dim, hidden_dim=hidden_dim)
+        sizes = {"feature_dim": feature_dim, "hidden_dim": hidden_dim}
+        self.materials = MaterialNetwork(**sizes, is_soft=is_soft, max_friction=max_friction)
+        self.moving_shading = MovingShading(**sizes)
         is_guessing = guess_hidden and keep_shape and carry_memory
         self.hidden_guess = HiddenGuess(feature_dim=feature_dim) if is_guessing else None
         if edge_reach is not None and edge_reach <= 0 or supported_speed < 0:
@@ -300,9 +301,6 @@ class InertialDynamics(AbstractDynamics):
         some = rows_of((current, memory), rows, count)
         return with_rows((current, memory), rows, some, self._step(*some), count)
 
-    def _is_slow(self, motion: BodyMotion) -> Bool[Tensor, "batch body"]:
-        return is_slow(motion, self.rest_share * self.force_scale, _ARM * self.contact_range)
-
     def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
         positions = take(current.positions, memory.index) - memory.origin
         static_positions = take(current.positions, memory.static_index) - memory.origin
@@ -310,7 +308,8 @@ class InertialDynamics(AbstractDynamics):
         if self.has_driven and current.driven is not None and current.driven.mask.any():
             driven = driven_bodies(current.driven, memory.origin)
         resolved = self._resolved(positions, static_positions, memory, driven)
-        step, onward = rested(resolved, self.rest_share * self.force_scale, _ARM * self.contact_range)
+        resting = self.rest_share * self.force_scale, _ARM * self.contact_range
+        step, onward = rested(resolved, *resting)
         own = memory.own
         moved = step.carried(positions, own)
         velocities = memory.velocities
@@ -329,7 +328,7 @@ class InertialDynamics(AbstractDynamics):
         if hidden is not None:
             places = (following, onward.centers, rotations)
             hidden, side = hidden_after(hidden, *places, self.moving_shading, memory.origin)
-        is_slow_now = self._is_slow(onward)
+        is_slow_now = is_slow(onward, *resting)
         undisturbed = memory.undisturbed & is_slow_now
         at_rest = resolved.touching.squeeze(-1) & is_slow_now | undisturbed | ~members_in_use(memory.bodies)
         memory = replace(memory, motion=onward, normals=turned, velocities=velocities, hidden=hidden)

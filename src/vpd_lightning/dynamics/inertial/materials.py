@@ -13,6 +13,9 @@ _GAIN = 4.0
 """Softness spans orders of magnitude and begins at its small end; a rate that suits the others would be too slow."""
 
 
+_FIRST_FRICTION = 0.5
+
+
 @dataclass(frozen=True)
 class Materials:
     """What a body is made of.
@@ -33,12 +36,19 @@ class Materials:
 class MaterialNetwork(nn.Module):
     """A small network on the mean features of a body; before training all bodies are alike, and nearly rigid.
 
-    The same numbers are inferred for the same features, so one model holds rigid and soft bodies.
+    The same numbers are inferred for the same features, so one model holds rigid and soft bodies. Where bodies slide on
+    a table their deceleration shows the product of friction and weight alone; with ``max_friction`` a large friction
+    cannot stand for a weight that is not learned yet (null: at most 7.4).
+
+    Raises:
+        ValueError: ``max_friction`` is not more than the 0.5 that training starts from.
     """
 
-    def __init__(self, *, feature_dim: int, hidden_dim: int, is_soft: bool):
+    def __init__(self, *, feature_dim: int, hidden_dim: int, is_soft: bool, max_friction: float | None):
         super().__init__()
-        self.is_soft = is_soft
+        if max_friction is not None and max_friction <= _FIRST_FRICTION:
+            raise ValueError(f"max_friction must be more than {_FIRST_FRICTION} or null, got {max_friction}")
+        self.is_soft, self.max_friction = is_soft, max_friction
         self.network = nn.Sequential(
             nn.LayerNorm(feature_dim), nn.Linear(feature_dim, hidden_dim), nn.SiLU(), nn.Linear(hidden_dim, 6)
         )
@@ -46,8 +56,9 @@ class MaterialNetwork(nn.Module):
         assert isinstance(last, nn.Linear)
         nn.init.zeros_(last.weight)
         with torch.no_grad():
-            # friction 0.5, restitution 0.1, density 1, softness 0.01, stiffness 0.25, damping 0.1
-            start = [math.log(0.5), _logit(0.1), 0.0, _logit(0.01) / _GAIN, _logit(0.25), _logit(0.1)]
+            # restitution 0.1, density 1, softness 0.01, stiffness 0.25, damping 0.1
+            first = math.log(_FIRST_FRICTION) if max_friction is None else _logit(_FIRST_FRICTION / max_friction)
+            start = [first, _logit(0.1), 0.0, _logit(0.01) / _GAIN, _logit(0.25), _logit(0.1)]
             last.bias.copy_(torch.tensor(start))
 
     def forward(
@@ -57,8 +68,11 @@ class MaterialNetwork(nn.Module):
         mean = torch.einsum("bkp,bpf->bkf", weights, features)
         friction, restitution, density, softness, stiffness, damping = self.network(mean).split(1, dim=-1)
         softness = torch.sigmoid(_GAIN * softness) if self.is_soft else torch.zeros_like(softness)
+        bounded = torch.exp(friction.clamp(-5, 2))
+        if self.max_friction is not None:
+            bounded = self.max_friction * torch.sigmoid(friction)
         return Materials(
-            friction=torch.exp(friction.clamp(-5, 2)),
+            friction=bounded,
             restitution=torch.sigmoid(restitution),
             density=torch.exp(density.clamp(-3, 3)),
             softness=softness,

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, vectors_of
 from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, nearest_static_contacts
+from vpd_lightning.dynamics.inertial.surface_edges import SurfaceEdges, surface_edges
 from vpd_lightning.geometry.spacing import point_spacing
 
 _BEHIND = 0.005
@@ -27,16 +28,15 @@ _MOST_CLEARANCE = 0.75
 class StaticSurface:
     """Points of what stands still that no camera saw, and how far a seen one reaches; lengths in metres.
 
-    ``positions`` are the footprints of bodies: what lies under them on the surface below. ``reach`` is how far beside a
-    point, of the static particles and then of the footprints, its surface goes on (infinite: it has no edge there);
-    None: no surface has an edge. ``clearances`` are how far above their surface (below it, where negative) the points
-    of resting bodies seem to end.
+    ``positions`` are the footprints of bodies: what lies under them on the surface below. ``edges`` is how far beside a
+    point, of the static particles and then of the footprints, its surface goes on; None: without end. ``clearances``
+    are how far above their surface (below it, where negative) the points of resting bodies seem to end.
     """
 
     positions: Float[Tensor, "batch footprint 3"]
     normals: Float[Tensor, "batch footprint 3"]
     mask: Bool[Tensor, "batch footprint"]
-    reach: Float[Tensor, "batch static_and_footprint"] | None
+    edges: SurfaceEdges | None
     clearances: Float[Tensor, "batch body"]
 
 
@@ -85,17 +85,26 @@ def static_surface(
     index, exists = _nearest_below(above, positions, normals, oriented)
     facing = vectors_of(normals, index)
     heights = ((above - vectors_of(positions, index)) * facing).sum(dim=-1, keepdim=True)
-    known = exists & is_above
-    reach = (edge_reach * point_spacing(positions, mask))[:, None].expand(-1, positions.shape[1] + above.shape[1])
+    spacing = point_spacing(positions, mask)
+    reach = (edge_reach * spacing)[:, None].expand_as(mask)
     if workspace is not None:
         to_wall = torch.minimum(positions - workspace[0], workspace[1] - positions).amin(dim=-1)
-        is_cut = torch.nn.functional.pad(to_wall < _AT_WALL * reach[:, :1], (0, above.shape[1]))
-        reach = reach.masked_fill(is_cut, torch.inf)
+        reach = reach.masked_fill(to_wall < _AT_WALL * reach, torch.inf)
+    edges = surface_edges(statics, spacing, reach)
+    # A footprint is part of the surface on which it lies: where that ends, it does.
+    there, offsets = edges.gathered(index), above - vectors_of(positions, index)
+    beside = offsets - heights * facing
+    known = exists & is_above & there.include(beside, torch.zeros_like(there.reach))
+    left = SurfaceEdges(
+        (edge_reach * spacing)[:, None].expand_as(known),
+        there.outward,
+        there.ends - (beside * there.outward).sum(dim=-1),
+    )
     return StaticSurface(
         positions=torch.where(known[..., None], above - heights * facing, 0.0),
         normals=torch.where(known[..., None], facing, 0.0),
         mask=known,
-        reach=reach,
+        edges=edges.joined(left),
         clearances=clearances,
     )
 
@@ -129,9 +138,9 @@ def static_contacts(
     """
     parts = zip(statics, (surface.positions, surface.normals, surface.mask), strict=True)
     joined = [torch.cat(part, dim=1) for part in parts] if surface.mask.shape[1] else list(statics)
-    found = nearest_static_contacts(points.positions, joined[0], joined[1], joined[2], far, surface.reach)
+    found = nearest_static_contacts(points.positions, joined[0], joined[1], joined[2], far, surface.edges)
     is_on = torch.ones_like(found.distances, dtype=torch.bool)
-    if surface.reach is not None:
+    if surface.edges is not None:
         is_on = _in_front(found, points, centers)
     lowered = found.distances - torch.gather(surface.clearances, 1, points.bodies)
     # Without a surface near, the distance is the farthest there is.
