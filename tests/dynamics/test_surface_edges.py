@@ -36,7 +36,7 @@ def found(statics: Statics) -> edges.SurfaceEdges:
 def reached(statics: Statics, places: list[tuple[float, float]]) -> list[bool]:
     """Whether the table's top is taken to be at some places."""
     queries = torch.tensor([[[x, y, 0.0] for x, y in places]], dtype=torch.float64)
-    index = torch.cdist(queries, statics[0]).argmin(dim=-1)
+    index = (queries[:, :, None] - statics[0][:, None]).square().sum(dim=-1).argmin(dim=-1)
     offsets = queries - torch.gather(statics[0], 1, index[..., None].expand(-1, -1, 3))
     flat = torch.where(torch.tensor([True, True, False]), offsets, 0.0)
     return found(statics).gathered(index).include(flat, flat.norm(dim=-1))[0].tolist()
