@@ -4,7 +4,8 @@
 in closed loop against MuJoCo: ``model`` (cross-entropy method), ``random`` (random shooting with the same number of
 candidates), ``truth`` (the same planner and candidates on the simulator itself, the ceiling) and ``nothing``. Worlds
 and tasks depend on the seed alone (seeds from ``FIRST_SEED`` on, which no data set has). Results are added to OUT.json
-task by task, so a stopped run goes on; success rates come with 95 % Wilson intervals.
+task by task, so a stopped run goes on (with the same settings, or it is refused); success rates come with 95 % Wilson
+intervals.
 """
 
 import argparse
@@ -26,11 +27,10 @@ from vpd_lightning.planning.tasks import KINDS, draw_task
 from vpd_lightning.planning.tool import PlanarTool
 
 FIRST_SEED = 1000
-NUM_SAMPLES, NUM_ITERATIONS, NUM_ELITES, SPREAD = 64, 2, 8, 0.7
+NUM_ITERATIONS, NUM_ELITES, SPREAD = 2, 8, 0.7
 NUM_KNOTS, HOLD, NUM_EXECUTED, NUM_DECISIONS = 6, 4, 2, 10
 MAX_SPEED = 0.016  # metres a frame: 0.4 m/s
 _SETTINGS = {
-    "num_samples": NUM_SAMPLES,
     "num_iterations": NUM_ITERATIONS,
     "num_elites": NUM_ELITES,
     "spread": SPREAD,
@@ -43,19 +43,19 @@ _SETTINGS = {
 _Z = 1.96
 
 
-def loop_of(solver_name: str, settings: PushingSettings) -> Loop:
+def loop_of(solver_name: str, settings: PushingSettings, num_samples: int) -> Loop:
     """Return how is planned: ``random`` draws as many candidates as the cross-entropy method does."""
     limit = np.asarray(settings.table.half_size) + settings.pusher.overhang
     solver = (
-        RandomShooting(NUM_SAMPLES, NUM_ITERATIONS)
+        RandomShooting(num_samples, NUM_ITERATIONS)
         if solver_name == "random"
-        else CrossEntropy(NUM_SAMPLES, NUM_ITERATIONS, NUM_ELITES, SPREAD)
+        else CrossEntropy(num_samples, NUM_ITERATIONS, NUM_ELITES, SPREAD)
     )
     tool = PlanarTool(MAX_SPEED, low=(-limit).tolist(), high=limit.tolist(), hold=HOLD)
     return Loop(tool, solver, NUM_KNOTS, NUM_EXECUTED, NUM_DECISIONS)
 
 
-def run(system: str, kind: str, number: int, settings: PushingSettings, model: Any) -> dict[str, Any]:
+def run(system: str, kind: str, number: int, settings: PushingSettings, model: Any, num_samples: int) -> dict[str, Any]:
     """Run one task with one system."""
     from data_gen.pushing.world import PushingWorld
 
@@ -63,7 +63,7 @@ def run(system: str, kind: str, number: int, settings: PushingSettings, model: A
     world = PushingWorld(settings, seed, "egl" if system in ("model", "random") else None)
     half_size = np.asarray(settings.table.half_size)
     task = draw_task(kind, world.places, half_size, np.random.default_rng([seed, KINDS.index(kind)]))  # type: ignore[arg-type]
-    loop = loop_of(system, settings)
+    loop = loop_of(system, settings, num_samples)
     try:
         if system == "nothing":
             episode = run_without_action(world, task, loop)
@@ -100,6 +100,7 @@ def main() -> None:
     parser.add_argument("--systems", nargs="+", default=["nothing", "truth", "model", "random"])
     parser.add_argument("--tasks", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--samples", type=int, default=32, help="candidates of each of the two iterations")
     add_option(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -107,25 +108,34 @@ def main() -> None:
     from vpd_lightning.loading import load_model
 
     name, ckpt = options.model.split("=", 1)
-    model = load_model(ckpt) if {"model", "random"} & set(options.systems) else None
-    changes = {} if model is None else change_dynamics(model, options.dynamics)  # what makes it faster
+    model = load_model(ckpt)
+    changes = change_dynamics(model, options.dynamics)  # what makes it faster
     settings = load_settings(PushingSettings, "pushing", "small", {})
+    used = {**_SETTINGS, "num_samples": options.samples, "dynamics of model": changes}
+    kept = _read(options.out, name)
+    if kept.get("settings", used) != used:
+        raise SystemExit(f"{options.out} was made with {kept['settings']}, not {used}: name another file.")
     for number in range(options.first, options.tasks):
         for kind in options.kinds:
             for system in options.systems:
-                result = json.loads(options.out.read_text()) if options.out.is_file() else {"model": name, "tasks": {}}
                 key = f"{system}/{kind}/{number}"
-                if key in result["tasks"]:
+                if key in _read(options.out, name)["tasks"]:
                     continue
-                found = run(system, kind, number, settings, model)
-                result = json.loads(options.out.read_text()) if options.out.is_file() else {"model": name, "tasks": {}}
+                found = run(system, kind, number, settings, model, options.samples)
+                result = _read(options.out, name)  # again: two runs may share a file
                 result["tasks"][key] = found
                 result["rates"] = rates(result["tasks"])
-                result["settings"] = {**_SETTINGS, "dynamics of model": changes}
+                result["settings"] = used
                 with AtomicPath(options.out) as path:
                     path.write_text(json.dumps(result, indent=1, sort_keys=True) + "\n")
                 print(key, found, flush=True)
     print_rates(json.loads(options.out.read_text())["tasks"])
+
+
+def _read(path: Path, name: str) -> dict[str, Any]:
+    """Return what was found so far."""
+    found: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {"model": name, "tasks": {}}
+    return found
 
 
 def rates(tasks: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
