@@ -41,6 +41,7 @@ SCENES = {
     "mujoco_block": "a tossed block",
     "deformable_collision": "two soft bodies",
     "movi_a": "rigid bodies",
+    "pushing": "pushed bodies",
 }
 
 

@@ -82,16 +82,26 @@ def predict(simulator: Simulator) -> torch.Tensor:
     return simulator.render(simulator.rollout(scene, num_steps=2), cameras(1))
 
 
-def synthetic_frames(*shape: int, size: int = SIZE, distance: float = 1.5) -> tuple[torch.Tensor, torch.Tensor]:
+def synthetic_frames(
+    *shape: int, size: int = SIZE, width: int | None = None, distance: float = 1.5
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Colours at random and a level ground near what ``cameras`` look at, always the same, with these leading axes."""
     generator = torch.Generator().manual_seed(0)
-    rgb = torch.randint(0, 256, (*shape, size, size, 3), generator=generator, dtype=torch.uint8)
-    return rgb, torch.full((*shape, size, size), 0.95 * distance)
+    picture = (*shape, size, width or size)
+    rgb = torch.randint(0, 256, (*picture, 3), generator=generator, dtype=torch.uint8)
+    return rgb, torch.full(picture, 0.95 * distance)
 
 
-def cameras(*shape: int, size: int = SIZE, center: Sequence[float] = (0.0, 0.0, 0.0), distance: float = 1.5) -> Cameras:
+def cameras(
+    *shape: int,
+    size: int = SIZE,
+    width: int | None = None,
+    center: Sequence[float] = (0.0, 0.0, 0.0),
+    distance: float = 1.5,
+) -> Cameras:
     """Cameras at ``distance`` (metres) above ``center``, looking down, with these leading axes."""
-    intrinsics = torch.tensor([[size, 0.0, size / 2], [0.0, size, size / 2], [0.0, 0.0, 1.0]])
+    across = width or size
+    intrinsics = torch.tensor([[size, 0.0, across / 2], [0.0, size, size / 2], [0.0, 0.0, 1.0]])
     pose = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     pose[:3, 3] = torch.tensor(center) + torch.tensor([0.0, 0.0, distance])
-    return Cameras(intrinsics.expand(*shape, 3, 3), pose.expand(*shape, 4, 4), size, size)
+    return Cameras(intrinsics.expand(*shape, 3, 3), pose.expand(*shape, 4, 4), size, across)

@@ -5,6 +5,7 @@ from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -59,12 +60,12 @@ def loaded(folder: Path) -> LoadedModel:
 def test_it_predicts(folder: Path) -> None:
     model = loaded(folder)
     past, views = model.simulator.num_context_frames, model.input_views
-    size = picture_size(model)
-    placed, distance = known_cameras(model, size)
+    size, width = picture_size(model)
+    placed, distance = known_cameras(model, size, width)
     seen = placed[:1] if isinstance(model.simulator, Simulator) else placed  # others predict the views they are given
-    rgb, depth = synthetic_frames(past, len(views), size=size, distance=distance)
+    rgb, depth = synthetic_frames(past, len(views), size=size, width=width, distance=distance)
     frames = model.simulator.predict_frames(RGBDFrames(rgb, depth, over_time(placed, past)), over_time(seen, STEPS))
-    assert frames.shape == (STEPS, *seen.shape, size, size, 3)
+    assert frames.shape == (STEPS, *seen.shape, size, width, 3)
     assert torch.isfinite(frames).all() and frames.min() >= 0 and frames.max() <= 1
     count = sum(parameter.numel() for parameter in model.simulator.parameters())
     assert count == json.loads((folder / "release.json").read_text())["num_parameters"]
@@ -74,9 +75,9 @@ def test_it_predicts(folder: Path) -> None:
 def test_it_says_the_same_in_float64_and_stays_finite(folder: Path) -> None:
     model = loaded(folder)
     past, views = model.simulator.num_context_frames, model.input_views
-    size = picture_size(model)
-    placed, distance = known_cameras(model, size)
-    rgb, depth = synthetic_frames(past, len(views), size=size, distance=distance)
+    size, width = picture_size(model)
+    placed, distance = known_cameras(model, size, width)
+    rgb, depth = synthetic_frames(past, len(views), size=size, width=width, distance=distance)
     # All cameras stand at one place: on level ground each point would be there once per view, and which of its copies
     # is a neighbour would be a matter of rounding.
     depth = depth * (1 + 0.02 * torch.rand(depth.shape, generator=torch.Generator().manual_seed(1)))
@@ -109,14 +110,23 @@ def stays_finite(system: AbstractSystem, context: RGBDFrames, seen: Cameras) -> 
     return all(bool(torch.isfinite(value).all()) for value in values)
 
 
-def picture_size(model: LoadedModel) -> int:
+def picture_size(model: LoadedModel) -> tuple[int, int]:
     """Height and width of the pictures a model was made for, where it is made for some."""
+    background = fitted_background(model)
+    if background is not None:
+        return background.depth.shape[-2], background.depth.shape[-1]
     encoder = model.config.get("encoder") or {}
-    sizes = [encoder.get("height"), (encoder.get("background") or {}).get("height")]
-    return next((size for size in sizes if isinstance(size, int)), 64)
+    made_for = encoder.get("height"), encoder.get("width")
+    return made_for if all(isinstance(size, int) for size in made_for) else (64, 64)
 
 
-def known_cameras(model: LoadedModel, size: int) -> tuple[Cameras, float]:
+def fitted_background(model: LoadedModel) -> Any:
+    """What a model knows of the background of fixed cameras; None for others."""
+    background = getattr(getattr(model.simulator, "encoder", None), "background", None)
+    return background if background is not None and background.needs_fit else None
+
+
+def known_cameras(model: LoadedModel, size: int, width: int) -> tuple[Cameras, float]:
     """Cameras for the input views that look at the workspace, and how far from its middle they are (metres).
 
     A model that knows the background of fixed cameras gets those.
@@ -124,9 +134,9 @@ def known_cameras(model: LoadedModel, size: int) -> tuple[Cameras, float]:
     scene, encoder = model.config["scene"], model.config.get("encoder") or {}
     center = [(low + high) / 2 for low, high in zip(scene["workspace_min"], scene["workspace_max"], strict=True)]
     distance = encoder.get("initial_depth") or (scene["near"] + scene["far"]) / 2
-    placed = cameras(len(model.input_views), size=size, center=center, distance=distance)
-    background = getattr(getattr(model.simulator, "encoder", None), "background", None)
-    if background is None or not background.needs_fit:
+    placed = cameras(len(model.input_views), size=size, width=width, center=center, distance=distance)
+    background = fitted_background(model)
+    if background is None:
         return placed, distance
     poses = background.cam_to_world[model.input_views]
     away = (poses[:, :3, 3] - torch.tensor(center)).norm(dim=-1).min()
