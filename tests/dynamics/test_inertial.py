@@ -386,18 +386,11 @@ def test_without_observed_normals_it_says_what_to_set():
         dynamics().initialize(current, replace(current, normals=None), RandomKeys.fixed(1))
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"num_bodies": 0},
-        {"num_probes": 0},
-        {"body_link": 0.0},
-        {"location_scale": -1.0},
-        {"force_scale": 0.0},
-        {"rest_share": -0.1},
-        {"shadow_scales": [0.0]},
-    ],
-)
-def test_wrong_settings_are_refused(changes):
-    with pytest.raises(ValueError, match=next(iter(changes)).removeprefix("shadow_")):
-        dynamics(**changes)
+WRONG = [("num_bodies", 0), ("num_probes", 0), ("body_link", 0.0), ("location_scale", -1.0), ("force_scale", 0.0)]
+WRONG += [("rest_share", -0.1), ("shadow_scales", [0.0])]
+
+
+@pytest.mark.parametrize(("name", "value"), WRONG)
+def test_wrong_settings_are_refused(name, value):
+    with pytest.raises(ValueError, match=name.removeprefix("shadow_")):
+        dynamics(**{name: value})
