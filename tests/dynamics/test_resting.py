@@ -7,6 +7,7 @@ import torch
 
 from tests.dynamics.solids import even_cube
 from tests.dynamics.test_inertial import dynamics
+from vpd_lightning.dynamics.inertial import driven_bodies
 from vpd_lightning.dynamics.inertial.resting import rows_of, with_rows
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.types import Driven, Particles
@@ -146,6 +147,23 @@ def test_with_gradients_nothing_is_skipped() -> None:
     assert not calls
     rolled(made, plate(-0.5, 0.0), 2, with_grad=True)
     assert len(calls) == 2
+
+
+def test_not_to_search_members_that_are_far_from_the_robot_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    near, far = plate(-0.13, 0.02), plate(-0.6, 0.02)
+    both = Driven(
+        *(torch.cat([getattr(near, name), getattr(far, name)]) for name in ("positions", "normals", "groups"))
+    )
+    both = replace(both, next_positions=torch.cat([near.next_positions, far.next_positions]), next_normals=both.normals)
+    searched = []
+    may_meet = driven_bodies._may_meet
+    monkeypatch.setattr(driven_bodies, "_may_meet", lambda *given: searched.append(may_meet(*given)) or searched[-1])
+    skipping = rolled(model(), both, 4)
+    assert searched and all(rows.tolist() == [True, False] for rows in searched)
+    monkeypatch.setattr(driven_bodies, "_may_meet", lambda bodies, *_: torch.ones(len(bodies.mask), dtype=torch.bool))
+    whole = rolled(model(), both, 4)
+    assert all(torch.equal(one.positions, other.positions) for one, other in zip(skipping, whole, strict=True))
+    assert not torch.equal(whole[-1].positions[0], whole[-1].positions[1])  # the near one pushed
 
 
 def test_rows_are_taken_and_put_back() -> None:

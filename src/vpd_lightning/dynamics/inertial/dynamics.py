@@ -64,11 +64,11 @@ class InertialDynamics(AbstractDynamics):
     With ``has_driven``, driven points are rigid parts of infinite mass that push bodies, with a friction of their own
     that is learned (``driven_bodies``); nothing pushes them.
 
-    With ``edge_reach`` (spacings of the static particles) a static surface ends that far beside its last particle, and
-    goes on under bodies; null: it goes on without end, as it does beyond the sides of the workspace that cut it. A body
-    that approaches the surface under it by less than ``supported_speed`` (in ``force_scale``, per step) when it is
-    first seen stands on it, whatever of its foot was seen (``static_surface``), and one that stands still does until
-    something pushes it (``resting.held``).
+    With ``edge_reach`` (spacings of the static particles) a static surface ends that far beside its last particle, at a
+    seen edge (``surface_edges``) with it, and goes on under bodies; null: it goes on without end, as it does beyond the
+    sides of the workspace that cut it. A body that approaches the surface under it by less than ``supported_speed``
+    (in ``force_scale``, per step) when it is first seen stands on it, whatever of its foot was seen
+    (``static_surface``), and one that stands still does until something pushes it (``resting.held``).
 
     With ``num_contact_substeps`` contact is resolved in so many parts of a step (``SubstepSolver``); null: at once.
 
