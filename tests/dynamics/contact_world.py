@@ -6,13 +6,8 @@ import torch
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, vectors_of
-from vpd_lightning.dynamics.inertial.contact import (
-    ContactPoints,
-    Contacts,
-    ContactSolver,
-    Resolved,
-    nearest_body_contacts,
-)
+from vpd_lightning.dynamics.inertial.contact import ContactSolver, Resolved
+from vpd_lightning.dynamics.inertial.contact_search import ContactPoints, Contacts, nearest_body_contacts
 from vpd_lightning.dynamics.inertial.materials import Materials, elastic
 from vpd_lightning.dynamics.inertial.rigid_motion import rotate, rotation_from_spin
 

@@ -5,7 +5,7 @@ import torch
 
 from tests.dynamics.contact_world import World
 from tests.dynamics.solids import even_ball, even_cube, random_rotation
-from vpd_lightning.dynamics.inertial.contact import ContactPoints, nearest_body_contacts
+from vpd_lightning.dynamics.inertial.contact_search import ContactPoints, nearest_body_contacts
 
 
 def momentum(world, motion):

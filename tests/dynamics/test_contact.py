@@ -8,7 +8,8 @@ import torch
 from tests.dynamics.contact_world import World
 from tests.dynamics.solids import UP, even_ball, even_cube, rotation_about
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia
-from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, ContactSolver, nearest_static_contacts
+from vpd_lightning.dynamics.inertial.contact import ContactSolver
+from vpd_lightning.dynamics.inertial.contact_search import ContactPoints, Contacts, nearest_static_contacts
 from vpd_lightning.dynamics.inertial.materials import Materials
 
 EYE = torch.eye(3, dtype=torch.float64)

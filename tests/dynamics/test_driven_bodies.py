@@ -8,7 +8,8 @@ from torch import Tensor
 
 from tests.dynamics.solids import even_ball, even_cube
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia
-from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, Resolved
+from vpd_lightning.dynamics.inertial.contact import Resolved
+from vpd_lightning.dynamics.inertial.contact_search import ContactPoints, Contacts
 from vpd_lightning.dynamics.inertial.driven_bodies import (
     Surface,
     driven_bodies,

@@ -45,6 +45,7 @@ SETTINGS = {
     "workspace_min": None,
     "workspace_max": None,
     "supported_speed": 0.0,
+    "round_contact": False,
     "skip_resting": False,
 }
 FIRST_VELOCITY = {

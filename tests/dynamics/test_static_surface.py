@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.dynamics.test_surface_edges import HALF, table_on_a_floor
 from vpd_lightning.dynamics.inertial import static_surface as surfaces
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
-from vpd_lightning.dynamics.inertial.contact import ContactPoints
+from vpd_lightning.dynamics.inertial.contact_search import ContactPoints
 from vpd_lightning.dynamics.inertial.static_surface import resting_clearances, static_surface, trusted_normals
 
 FAR = 10.0
@@ -128,6 +129,22 @@ def test_footprints_near_an_edge_are_on_the_top() -> None:
     assert found.mask.all() and torch.allclose(found.positions[..., 2], torch.zeros(1, 2).double(), atol=1e-12)
 
 
+@pytest.mark.parametrize("hidden", [0.05, 0.08])
+def test_what_is_beyond_the_edge_when_first_seen_stands_on_nothing(hidden: float) -> None:
+    """It hides the rim: particles around that hole, which are not at it, must know where the table ends."""
+    held = []
+    for y in range(-25, 26, 5):
+        middle = torch.tensor([HALF, 0.01 * y, 0.0], dtype=torch.float64)
+        positions, normals, mask = table_on_a_floor()
+        seen = (positions[0] - middle).norm(dim=-1) > hidden
+        statics = positions[:, seen], normals[:, seen], mask[:, seen]
+        body = probes(*[(HALF + 0.01 * x, 0.01 * (y + z), 0.02) for x in range(-4, 5) for z in range(-4, 5)])
+        found = static_contacts(surface_of(statics, body), body, statics, FAR)
+        is_held = (found.distances < 0.1) & (found.normals[..., 2] > 0.9)
+        held.append(is_held[0, body.positions[0, :, 0] > HALF + 0.012].double().mean().item())
+    assert sum(held) / len(held) < 0.25, held  # without the edges of neighbours 0.6 and 0.99
+
+
 def test_a_normal_that_its_neighbours_do_not_share_is_not_trusted() -> None:
     positions, normals, mask = table_with_a_side(slanted=True)
     kept = trusted_normals(positions, normals, mask).norm(dim=-1)[0] > 0.5
@@ -138,7 +155,7 @@ def test_a_normal_that_its_neighbours_do_not_share_is_not_trusted() -> None:
 
 
 def test_without_an_edge_and_without_rest_nothing_is_different() -> None:
-    from vpd_lightning.dynamics.inertial.contact import nearest_static_contacts
+    from vpd_lightning.dynamics.inertial.contact_search import nearest_static_contacts
 
     statics, points = table(), probes((0.2, 0.23, 0.1), (3.0, 0.2, -0.1))
     plain = nearest_static_contacts(points.positions, *statics, FAR)

@@ -9,7 +9,8 @@ from torch import Tensor
 from tests.dynamics.solids import even_cube
 from tests.dynamics.test_driven_bodies import HALF, OneBody, moved, plate
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia
-from vpd_lightning.dynamics.inertial.contact import BodyContacts, ContactPoints, Contacts, Resolved
+from vpd_lightning.dynamics.inertial.contact import Resolved
+from vpd_lightning.dynamics.inertial.contact_search import BodyContacts, ContactPoints, Contacts
 from vpd_lightning.dynamics.inertial.materials import Materials
 from vpd_lightning.dynamics.inertial.substeps import SubstepSolver
 

@@ -55,6 +55,17 @@ def test_a_table_ends_where_it_ends() -> None:
     assert torch.allclose(lengths[is_edge], torch.ones(int(is_edge.sum())).double()) and not lengths[~is_edge].any()
 
 
+def test_no_particle_near_the_rim_is_without_its_edge() -> None:
+    statics = table_on_a_floor()
+    made, places = found(statics), statics[0][0]
+    spacing = point_spacing(statics[0], statics[2]).item()
+    is_top = places[:, 2] == 0
+    near_rim = is_top & (places[:, :2].abs().amax(dim=-1) > HALF - spacing)
+    assert near_rim.sum() > 50 and torch.isfinite(made.ends[0, near_rim]).all()
+    inside = is_top & (places[:, :2].abs().amax(dim=-1) < HALF - 4 * spacing)
+    assert inside.sum() > 200 and torch.isinf(made.ends[0, inside]).double().mean() > 0.95
+
+
 def test_what_is_beside_a_table_is_not_on_it() -> None:
     statics = table_on_a_floor()
     along = [-0.3 + 0.05 * step for step in range(13)]

@@ -47,6 +47,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "workspace_min": None,
         "workspace_max": None,
         "supported_speed": 0.0,
+        "round_contact": False,
         "skip_resting": False,
     },
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, vectors_of
-from vpd_lightning.dynamics.inertial.contact import Contacts
+from vpd_lightning.dynamics.inertial.contact_search import Contacts
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rotate
 
 

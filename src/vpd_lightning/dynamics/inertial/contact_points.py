@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import vectors_of
-from vpd_lightning.dynamics.inertial.contact import BodyContacts, ContactPoints, nearest_body_contacts
+from vpd_lightning.dynamics.inertial.contact_search import BodyContacts, ContactPoints, nearest_body_contacts
 from vpd_lightning.dynamics.inertial.driven_bodies import Surface
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
 

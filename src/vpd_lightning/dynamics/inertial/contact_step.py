@@ -7,8 +7,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia
-from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, ContactSolver, Resolved
+from vpd_lightning.dynamics.inertial.contact import ContactSolver, Resolved
 from vpd_lightning.dynamics.inertial.contact_points import between_bodies, pushed_surface
+from vpd_lightning.dynamics.inertial.contact_search import ContactPoints, Contacts
 from vpd_lightning.dynamics.inertial.driven_bodies import (
     DrivenBodies,
     driven_bodies,

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, vectors_of
-from vpd_lightning.dynamics.inertial.contact import BodyContacts, ContactPoints, Contacts
+from vpd_lightning.dynamics.inertial.contact_search import BodyContacts, ContactPoints, Contacts
 from vpd_lightning.dynamics.inertial.materials import Materials
 from vpd_lightning.dynamics.inertial.nearest import nearest_usable
 from vpd_lightning.dynamics.inertial.resting import rows_of
@@ -131,6 +131,7 @@ def meet(
             torch.cat([points.positions, points.positions, bodies.positions, taken["positions"]], dim=1),
             torch.cat([points.normals, points.normals, bodies.normals, taken["normals"]], dim=1),
             members,
+            points.feet,
         ),
         static=Contacts(*(_padded(values, members.shape[-1]) for values in _parts(static))),
         between=BodyContacts(torch.cat(others, dim=1), torch.cat(known, dim=1)),

@@ -30,6 +30,7 @@ from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, elastic
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
 from vpd_lightning.dynamics.inertial.resting import held, is_slow, members_in_use, rested, rows_of, with_rows
 from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, rotate, rotation_from_spin
+from vpd_lightning.dynamics.inertial.round_bodies import fit_ellipsoids, on_feet, with_feet
 from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
 from vpd_lightning.dynamics.inertial.standing import may_be_hidden, standing
 from vpd_lightning.dynamics.inertial.static_surface import static_contacts, static_surface, trusted_normals
@@ -71,6 +72,8 @@ class InertialDynamics(AbstractDynamics):
     (``static_surface``), and one that stands still does until something pushes it (``resting.held``).
 
     With ``num_contact_substeps`` contact is resolved in so many parts of a step (``SubstepSolver``); null: at once.
+
+    With ``round_contact`` bodies that are ellipsoids, as far as was seen, roll as such (``round_bodies``).
 
     With ``skip_resting``, and without gradients, a member of the batch in which all bodies rest (in contact, slower
     than ``rest_share``) and nothing driven is about to push one stays as it is.
@@ -120,6 +123,7 @@ class InertialDynamics(AbstractDynamics):
         workspace_min: Sequence[float] | None,
         workspace_max: Sequence[float] | None,
         supported_speed: float,
+        round_contact: bool,
         skip_resting: bool,
     ):
         super().__init__()
@@ -137,8 +141,9 @@ class InertialDynamics(AbstractDynamics):
                 "rest_share, residual_share and extent_weight must not be negative, "
                 f"got {rest_share}, {residual_share} and {extent_weight}"
             )
-        self.num_bodies, self.num_probes = num_bodies, num_probes
-        self.body_link, self.max_concavity, self.max_concave_share = body_link, max_concavity, max_concave_share
+        self.num_probes = num_probes
+        limits = {"max_concavity": max_concavity, "max_concave_share": max_concave_share}
+        self.grouping = {"num_bodies": num_bodies, "body_link": body_link, **limits}
         self.force_scale, self.rest_share = force_scale, rest_share
         self.contact_range, self.contact_reach = contact_range, contact_reach
         self.num_contact_iterations, self.num_contact_substeps = num_contact_iterations, num_contact_substeps
@@ -167,6 +172,7 @@ class InertialDynamics(AbstractDynamics):
                 f"got {edge_reach} and {supported_speed}"
             )
         self.edge_reach, self.supported_speed, self.skip_resting = edge_reach, supported_speed, skip_resting
+        self.round_contact = round_contact
         self.workspace = None if workspace_min is None or workspace_max is None else (workspace_min, workspace_max)
         self.has_driven = has_driven
         self.log_driven_friction = nn.Parameter(torch.tensor(math.log(0.3))) if has_driven else None
@@ -186,19 +192,14 @@ class InertialDynamics(AbstractDynamics):
         index, _ = gather_index(movable(current))
         origin = take(current.positions, index[:, :1]).detach()
         previous, current = (replace(frame, positions=frame.positions - origin) for frame in (previous, current))
-        found = find_first_motion(
-            previous,
-            current,
-            num_bodies=self.num_bodies,
-            body_link=self.body_link,
-            max_concavity=self.max_concavity,
-            max_concave_share=self.max_concave_share,
-            first_velocity=self.first_velocity,
-        )
+        found = find_first_motion(previous, current, first_velocity=self.first_velocity, **self.grouping)  # type: ignore[arg-type]
         index, mask, seen, bodies = found.index, found.mask, found.seen, found.bodies
         shares = bodies / bodies.sum(dim=-1, keepdim=True).clamp(min=1)
         with torch.no_grad():
             centers = equidistant_centers(seen.positions, seen.normals, shares, self.extent_weight)
+            shapes = torch.zeros_like(centers)[..., None].repeat(1, 1, 1, 3)
+            if self.round_contact:
+                centers, shapes = fit_ellipsoids(seen.positions, seen.normals, bodies, centers)
             static_index, static_mask = gather_index(current.mask & ~movable(current))
             static_positions = take(current.positions, static_index)
             static_normals = take(current.normals, static_index)  # type: ignore[arg-type]
@@ -242,6 +243,7 @@ class InertialDynamics(AbstractDynamics):
             hidden=hidden,
             undisturbed=torch.zeros_like(empty, dtype=torch.bool),
             surface=static_surface((seen.positions, seen.normals, mask), seen.positions, mask, None, empty),
+            shapes=shapes,
             at_rest=~members_in_use(bodies),
         )
         return standing(
@@ -331,8 +333,9 @@ class InertialDynamics(AbstractDynamics):
         is_slow_now = is_slow(onward, *resting)
         undisturbed = memory.undisturbed & is_slow_now
         at_rest = resolved.touching.squeeze(-1) & is_slow_now | undisturbed | ~members_in_use(memory.bodies)
+        shapes = rotations @ memory.shapes @ rotations.mT
         memory = replace(memory, motion=onward, normals=turned, velocities=velocities, hidden=hidden)
-        memory = replace(memory, undisturbed=undisturbed, at_rest=at_rest)
+        memory = replace(memory, undisturbed=undisturbed, at_rest=at_rest, shapes=shapes)
         # Normals rotate with their bodies: a memory rebuilt from these particles needs those of the new pose.
         normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
         return replace(current, positions=all_positions, features=features, normals=normals, hidden_side=side), memory
@@ -357,7 +360,10 @@ class InertialDynamics(AbstractDynamics):
         moved = vectors_of(memory.motion.displacements, own) + memory.motion.turned(offsets, own) - offsets
         statics = (static_positions, memory.static_normals, memory.static_mask)
         points = contact_points(probe_positions, memory, members, self.mirror_hidden)
-        contacts = static_contacts(memory.surface, points, statics, memory.motion.centers, self.contact_reach)
+        surface, centers, far = memory.surface, memory.motion.centers, self.contact_reach
+        joined = surface.joined(statics)
+        points = with_feet(points, memory.shapes, memory.motion, joined, surface.edges, surface.clearances, far)
+        contacts = static_contacts(surface, points, statics, centers, far)
         motion = self.forces(
             probe_positions,
             moved * memory.mask[:, probes, None],
@@ -374,7 +380,7 @@ class InertialDynamics(AbstractDynamics):
             memory,
             positions,
             points,
-            contacts,
+            on_feet(contacts, points, far),
             driven,
             None if self.log_driven_friction is None else self.log_driven_friction.exp(),
             is_mirrored=self.mirror_hidden,

@@ -7,10 +7,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vpd_lightning.dynamics.inertial.contact import nearest_static_contacts
 from vpd_lightning.dynamics.inertial.contact_points import body_sizes, contact_points
+from vpd_lightning.dynamics.inertial.contact_search import nearest_static_contacts
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
 from vpd_lightning.dynamics.inertial.resting import is_slow
+from vpd_lightning.dynamics.inertial.round_bodies import rolling, touches, with_feet
 from vpd_lightning.dynamics.inertial.static_surface import resting_clearances, static_surface
 from vpd_lightning.types import Driven
 
@@ -45,9 +46,15 @@ def standing(
         probes, members = positions[:, :num_probes], memory.bodies[:, :, :num_probes]
         # Mirror images that would lie in the surface count as well: they say how wide the foot is.
         points = contact_points(probes, replace(memory, mirrored=memory.mask), members, is_mirrored)
+        points = with_feet(points, memory.shapes, memory.motion, statics, None, clearances, far)
         sizes = body_sizes(memory)
         clearances, rests = resting_clearances(points, statics, memory.motion, sizes, supported_speed, far)
         undisturbed = rests & is_slow(memory.motion, rest_speed, arm)
+        is_held = torch.zeros_like(rests)
+        if driven is not None:
+            places = driven.positions - memory.origin
+            is_held = touches(memory.shapes, memory.motion.centers, places, driven.mask)
+        memory = replace(memory, motion=rolling(memory.motion, points.feet, is_held))
         memory = replace(
             memory,
             mirrored=memory.mask & (memory.mirrored | torch.gather(rests, 1, memory.own)),

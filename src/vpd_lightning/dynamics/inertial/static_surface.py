@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, vectors_of
-from vpd_lightning.dynamics.inertial.contact import ContactPoints, Contacts, nearest_static_contacts
+from vpd_lightning.dynamics.inertial.contact_search import ContactPoints, Contacts, nearest_static_contacts
+from vpd_lightning.dynamics.inertial.round_bodies import on_feet
 from vpd_lightning.dynamics.inertial.surface_edges import SurfaceEdges, surface_edges
 from vpd_lightning.geometry.spacing import point_spacing
 
@@ -38,6 +39,17 @@ class StaticSurface:
     mask: Bool[Tensor, "batch footprint"]
     edges: SurfaceEdges | None
     clearances: Float[Tensor, "batch body"]
+
+    def joined(self, statics: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return static particles (positions, normals, mask) and behind them the footprints."""
+        if self.mask.shape[1] == 0:
+            return statics
+        positions, normals, mask = statics
+        return (
+            torch.cat([positions, self.positions], dim=1),
+            torch.cat([normals, self.normals], dim=1),
+            torch.cat([mask, self.mask], dim=1),
+        )
 
 
 @torch.no_grad()
@@ -136,9 +148,7 @@ def static_contacts(
 
     A surface that ends acts on bodies whose centre is in front of it: the side of a table not on what stands on top.
     """
-    parts = zip(statics, (surface.positions, surface.normals, surface.mask), strict=True)
-    joined = [torch.cat(part, dim=1) for part in parts] if surface.mask.shape[1] else list(statics)
-    found = nearest_static_contacts(points.positions, joined[0], joined[1], joined[2], far, surface.edges)
+    found = nearest_static_contacts(points.positions, *surface.joined(statics), far, surface.edges)
     is_on = torch.ones_like(found.distances, dtype=torch.bool)
     if surface.edges is not None:
         is_on = _in_front(found, points, centers)
@@ -175,7 +185,7 @@ def resting_clearances(
     is a guess. One that does not approach its surface (slower than ``max_speed``, metres per step, along the normal)
     and is near is supported: there it ends. Zero for all others.
     """
-    found = nearest_static_contacts(points.positions, *statics, far)
+    found = on_feet(nearest_static_contacts(points.positions, *statics, far), points, far)
     known = (found.normals.square().sum(dim=-1) > 0.5) & _in_front(found, points, motion.centers)
     belongs = (points.members > 0) & known[:, None]
     gaps, lowest = found.distances[:, None].masked_fill(~belongs, torch.inf).min(dim=-1)

@@ -6,15 +6,8 @@ import torch
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
-from vpd_lightning.dynamics.inertial.contact import (
-    BodyContacts,
-    Contacts,
-    ContactSolver,
-    Pairs,
-    Resolved,
-    as_push,
-    velocity_at,
-)
+from vpd_lightning.dynamics.inertial.contact import ContactSolver, Pairs, Resolved, as_push, velocity_at
+from vpd_lightning.dynamics.inertial.contact_search import BodyContacts, Contacts
 
 
 class SubstepSolver(ContactSolver):

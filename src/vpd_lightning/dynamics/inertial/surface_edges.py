@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vpd_lightning.dynamics.inertial.body_motion import vectors_of
+
 _NEAR, _FAR = 2.5, 10.0
 """Spacings of the static particles: neighbours on a surface, and how far beside its end others are looked for."""
 
@@ -17,6 +19,12 @@ _ONE_SIDED = 0.3
 
 _CONE, _BESIDE = 0.7, 1.2
 """Cosine of directions that lead outward, and spacings beside such a line within which particles say where it ends."""
+
+_ALIKE = 0.9
+"""Cosine of directions outward that are those of one edge."""
+
+_TYPICAL = 0.65
+"""Quantile of what neighbours say of one edge that is taken: gaps inside of a surface let some say too little."""
 
 _GAP = 0.25
 """Spacings from the outermost of some random particles to where the surface ends."""
@@ -63,13 +71,16 @@ def surface_edges(
 
     A particle is near an edge where its neighbours on the surface are on one side, nothing on the same plane was seen
     beyond, and something below it was: a hole that a body hides has the surface on its other side, and what nobody saw
-    has nothing. There the surface ends where its particles do.
+    has nothing. There the surface ends where its particles do; also for the particles around, on the same plane: beside
+    a corner, or a row further in, one sees no edge of its own, and would carry what lies beyond that of its neighbour.
     """
     parts = [slice(start, start + _AT_ONCE) for start in range(0, statics[0].shape[1], _AT_ONCE)]
     found = [_of_some(statics, spacing, some) for some in parts]
     if not found:
         return SurfaceEdges(reach, torch.zeros_like(statics[0]), torch.full_like(reach, torch.inf))
     outward, ends = (torch.cat(each, dim=1) for each in zip(*found, strict=True))
+    around = [_from_neighbors(statics, spacing, outward, ends, some) for some in parts]
+    outward, ends = (torch.cat(each, dim=1) for each in zip(*around, strict=True))
     return SurfaceEdges(reach, outward, ends)
 
 
@@ -100,3 +111,25 @@ def _of_some(
     last = _GAP + out.masked_fill(~((near > 0) & (beside < _BESIDE)), 0.0).amax(dim=2).clamp(min=0)
     ends = torch.where(is_edge, last * unit[..., 0], torch.inf)
     return outward * is_edge[..., None], ends
+
+
+def _from_neighbors(
+    statics: tuple[Tensor, Tensor, Tensor], spacing: Float[Tensor, " batch"], outward: Tensor, ends: Tensor, some: slice
+) -> tuple[Float[Tensor, "batch some 3"], Float[Tensor, "batch some"]]:
+    """Return edges of some of the particles, with that of the nearest one near an edge where they have none."""
+    positions, normals = statics[0], statics[1][:, some]
+    offsets = positions[:, None] - positions[:, some, None]
+    heights = (offsets * normals[:, :, None]).sum(dim=-1)
+    square = offsets.square().sum(dim=-1)
+    unit = spacing[:, None, None]
+    same = torch.isfinite(ends)[:, None] & (heights.abs() < _FLAT * unit) & (square < (_NEAR * unit).square())
+    square = square.masked_fill(~same, torch.inf)
+    nearest, index = square.min(dim=-1)
+    agreeing = same & (vectors_of(outward, index) @ outward.mT > _ALIKE)
+    mean = agreeing.to(square.dtype) @ outward
+    mean = mean / mean.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
+    places = offsets + (outward * ends.nan_to_num(posinf=0.0)[..., None])[:, None]
+    reaches = (places * mean[:, :, None]).sum(dim=-1).masked_fill(~agreeing, torch.nan)
+    typical = torch.nanquantile(reaches, _TYPICAL, dim=-1)
+    is_near = torch.isfinite(nearest) & statics[2][:, some] & (normals.square().sum(dim=-1) > 0.5)
+    return mean * is_near[..., None], torch.where(is_near, typical, torch.inf)
