@@ -167,6 +167,15 @@ def test_beyond_an_edge_a_foot_faces_the_edge(beyond: float) -> None:
     assert torch.allclose(found.normals[0, 0], towards / towards.norm())
 
 
+def test_without_anything_that_stands_still_there_are_no_feet() -> None:
+    shapes, centers = balls((0.0, 0.0, 0.1))
+    nothing = ContactPoints(centers[:, :0], centers[:, :0], centers.new_zeros(1, 1, 0))
+    empty = tuple(part[:, :0] for part in ground())
+    at_rest = resting_motion(centers, (0, 0, 0))
+    assert with_feet(nothing, shapes, at_rest, empty, None, torch.zeros(1, 1).double(), FAR).feet is None
+    assert with_feet(nothing, 0 * shapes, at_rest, ground(), None, torch.zeros(1, 1).double(), FAR).feet is None
+
+
 def test_what_a_body_is_deep_in_is_not_under_it() -> None:
     shapes, centers = balls((0.0, 0.0, 0.3 * RADIUS))
     assert feet_of(shapes, centers, ground()).distances.tolist() == [[FAR, FAR]]

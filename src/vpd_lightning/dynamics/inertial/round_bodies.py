@@ -180,9 +180,9 @@ def with_feet(
     a body's foot seems to be when it stands there. Forces act where the foot is in the middle of the step: at its
     beginning, an ellipsoid would gain energy while it rolls.
     """
-    if not bool(shapes.any()):
-        return points
     positions, normals, mask = statics
+    if positions.shape[1] == 0 or not bool(shapes.any()):
+        return points
     centers = motion.centers
     with torch.no_grad():
         oriented = mask & (normals.square().sum(dim=-1) > 0.5)
