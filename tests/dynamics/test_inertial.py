@@ -46,6 +46,7 @@ SETTINGS = {
     "workspace_max": None,
     "supported_speed": 0.0,
     "round_contact": False,
+    "damps_spin": True,
     "skip_resting": False,
 }
 FIRST_VELOCITY = {
@@ -388,7 +389,7 @@ def test_without_observed_normals_it_says_what_to_set():
 
 
 WRONG = [("num_bodies", 0), ("num_probes", 0), ("body_link", 0.0), ("location_scale", -1.0), ("force_scale", 0.0)]
-WRONG += [("rest_share", -0.1), ("shadow_scales", [0.0])]
+WRONG += [("rest_share", -0.1), ("shadow_scales", [0.0]), ("edge_reach", 0.0), ("supported_speed", -1.0)]
 
 
 @pytest.mark.parametrize(("name", "value"), WRONG)

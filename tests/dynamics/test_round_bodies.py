@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.dynamics.solids import even_cube, random_rotation
+from vpd_lightning.dynamics.inertial.body_forces import BodyForces
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia
 from vpd_lightning.dynamics.inertial.contact_search import ContactPoints, Contacts, nearest_static_contacts
 from vpd_lightning.dynamics.inertial.materials import Materials
@@ -300,3 +301,25 @@ def test_gradients_are_finite_with_a_body_that_is_none_beside_it() -> None:
     (found.distances.sum() + found.normals.sum() + found.lateral.sum()).backward()
     assert shapes.grad is not None and centers.grad is not None
     assert shapes.grad.isfinite().all() and centers.grad.isfinite().all() and centers.grad.any()
+
+
+@pytest.mark.parametrize("damps_spin", [True, False])
+def test_a_spin_is_damped_only_where_that_is_wanted(damps_spin: bool) -> None:
+    forces = BodyForces(
+        hidden_dim=8, message_passing_steps=1, num_forces=2, location_scale=0.1, force_scale=0.06, residual_share=0.0,
+        acceleration_gain=1.0, contact_range=0.4, damps_spin=damps_spin,
+    ).double()  # fmt: skip
+    points, _ = ellipsoid(60, (RADIUS, RADIUS, RADIUS))
+    members, centers = torch.ones(1, 1, 60).double(), torch.zeros(1, 1, 3).double()
+    spinning = replace(resting_motion(centers, (0.01, 0, 0)), spins=torch.tensor([[[0.1, 0.2, 0.3]]]).double())
+    nothing_near = Contacts(
+        torch.full((1, 60), FAR).double(), torch.zeros(1, 60, 3).double(), torch.zeros(1, 60).double()
+    )
+    inertia = body_inertia(points[None], centers, members / 60, torch.zeros(1, 1, 1).double(), torch.ones(()).double())
+    mask = torch.ones(1, 60) > 0
+    made = forces(points[None], torch.zeros(1, 60, 3).double(), nothing_near, mask, members, spinning, inertia)
+    kept = made.spins / spinning.spins
+    assert torch.allclose(
+        kept, torch.full_like(kept, torch.sigmoid(torch.tensor(5.0)).item() if damps_spin else 1.0), atol=1e-6
+    )
+    assert made.displacements[0, 0, 0] < 0.01

@@ -48,6 +48,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "workspace_max": None,
         "supported_speed": 0.0,
         "round_contact": False,
+        "damps_spin": True,
         "skip_resting": False,
     },
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},

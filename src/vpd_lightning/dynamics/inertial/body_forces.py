@@ -23,7 +23,8 @@ class BodyForces(nn.Module):
     until that is learned, the other forces must not replace it. ``acceleration_gain`` multiplies the learning rate of
     the common acceleration: an update changes three numbers by less than it does the output of a network.
     Damping scales the carried velocity: impacts and friction remove motion
-    in proportion to it. Zero-initialised: no force, hardly any damping (0.7 % a step).
+    in proportion to it. Zero-initialised: no force, hardly any damping (0.7 % a step). Without ``damps_spin`` a spin
+    ends by contact and torque alone: pixels hardly show how a round body turns, and a damped one stops rolling.
     """
 
     def __init__(
@@ -37,8 +38,10 @@ class BodyForces(nn.Module):
         residual_share: float,
         acceleration_gain: float,
         contact_range: float,
+        damps_spin: bool,
     ):
         super().__init__()
+        self.damps_spin = damps_spin
         self.num_forces, self.contact_range = num_forces, contact_range
         self.location_scale, self.force_scale = location_scale, force_scale
         self.residual_scale = residual_share * force_scale
@@ -160,11 +163,12 @@ class BodyForces(nn.Module):
         weight = self.residual_scale * torch.tanh(self.weight(body)) + self.common_acceleration()
         # Nearly one at initialisation; it may remove motion, never add any: a long rollout cannot feed on itself.
         keep = torch.sigmoid(self.damping(body) + 5.0)
+        keep_spin = keep[..., 1:] if self.damps_spin else torch.ones_like(keep[..., 1:])
         weight, torque = weight * there[..., None], torque * there[..., None]
         return replace(
             motion,
             displacements=motion.displacements * keep[..., :1] + push * there[..., None] + weight,
-            spins=motion.spins * keep[..., 1:] + rotate(inertia.inverse_turning, torque),
+            spins=motion.spins * keep_spin + rotate(inertia.inverse_turning, torque),
         )
 
 

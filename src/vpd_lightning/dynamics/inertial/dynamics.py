@@ -124,23 +124,23 @@ class InertialDynamics(AbstractDynamics):
         workspace_max: Sequence[float] | None,
         supported_speed: float,
         round_contact: bool,
+        damps_spin: bool,
         skip_resting: bool,
     ):
         super().__init__()
         counts = {"num_bodies": num_bodies, "num_probes": num_probes, "num_contact_substeps": num_contact_substeps or 1}
-        for name, value in counts.items():
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
-        for name, scale in (("body_link", body_link), ("location_scale", location_scale), ("force_scale", force_scale)):
-            if scale <= 0:
-                raise ValueError(f"{name} must be positive, got {scale}")
-        if acceleration_gain <= 0:
-            raise ValueError(f"acceleration_gain must be positive, got {acceleration_gain}")
-        if min(rest_share, residual_share, extent_weight) < 0:
-            raise ValueError(
-                "rest_share, residual_share and extent_weight must not be negative, "
-                f"got {rest_share}, {residual_share} and {extent_weight}"
-            )
+        for name, count in counts.items():
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}")
+        lengths = {"body_link": body_link, "location_scale": location_scale, "force_scale": force_scale}
+        reach = {} if edge_reach is None else {"edge_reach": edge_reach}
+        for name, value in {**lengths, **reach, "acceleration_gain": acceleration_gain}.items():
+            if value <= 0:
+                raise ValueError(f"{name} must be positive, got {value}")
+        shares = {"rest_share": rest_share, "residual_share": residual_share, "extent_weight": extent_weight}
+        for name, value in {**shares, "supported_speed": supported_speed}.items():
+            if value < 0:
+                raise ValueError(f"{name} must not be negative, got {value}")
         self.num_probes = num_probes
         limits = {"max_concavity": max_concavity, "max_concave_share": max_concave_share}
         self.grouping = {"num_bodies": num_bodies, "body_link": body_link, **limits}
@@ -160,17 +160,13 @@ class InertialDynamics(AbstractDynamics):
             residual_share=residual_share,
             acceleration_gain=acceleration_gain,
             contact_range=contact_range,
+            damps_spin=damps_spin,
         )
         sizes = {"feature_dim": feature_dim, "hidden_dim": hidden_dim}
         self.materials = MaterialNetwork(**sizes, is_soft=is_soft, max_friction=max_friction)
         self.moving_shading = MovingShading(**sizes)
         is_guessing = guess_hidden and keep_shape and carry_memory
         self.hidden_guess = HiddenGuess(feature_dim=feature_dim) if is_guessing else None
-        if edge_reach is not None and edge_reach <= 0 or supported_speed < 0:
-            raise ValueError(
-                "edge_reach must be positive or null and supported_speed not negative, "
-                f"got {edge_reach} and {supported_speed}"
-            )
         self.edge_reach, self.supported_speed, self.skip_resting = edge_reach, supported_speed, skip_resting
         self.round_contact = round_contact
         self.workspace = None if workspace_min is None or workspace_max is None else (workspace_min, workspace_max)
