@@ -32,4 +32,4 @@ def test_variants_change_what_they_name():
         assert isinstance(dynamics, InertialDynamics) and dynamics.first_velocity is not None
         for name, value in settings.items():
             assert getattr(dynamics.first_velocity, name) == value
-        assert (dynamics.num_bodies == 1) == (variant == "one body")
+        assert (dynamics.grouping["num_bodies"] == 1) == (variant == "one body")
