@@ -24,6 +24,9 @@ class Contacts:
         """Return those of the first probes."""
         return Contacts(self.distances[:, :count], self.normals[:, :count], self.lateral[:, :count])
 
+    def parts(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.distances, self.normals, self.lateral
+
 
 @dataclass(frozen=True)
 class ContactPoints:

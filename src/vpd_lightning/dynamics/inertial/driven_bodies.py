@@ -133,7 +133,7 @@ def meet(
             members,
             points.feet,
         ),
-        static=Contacts(*(_padded(values, members.shape[-1]) for values in _parts(static))),
+        static=Contacts(*(_padded(values, members.shape[-1]) for values in static.parts())),
         between=BodyContacts(torch.cat(others, dim=1), torch.cat(known, dim=1)),
     )
 
@@ -259,10 +259,6 @@ def _met_by_bodies(
     beside = offsets.square().sum(dim=-1) - height.square()
     inside = (beside < (_REACH * bodies.spacing[:, None]).square()) & (height < 0) & (height > -depth)
     return nearest, exists & points.members.any(dim=1) & inside
-
-
-def _parts(contacts: Contacts) -> tuple[Tensor, Tensor, Tensor]:
-    return contacts.distances, contacts.normals, contacts.lateral
 
 
 def _padded(values: Tensor, count: int) -> Tensor:

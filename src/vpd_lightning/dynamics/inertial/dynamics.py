@@ -193,7 +193,7 @@ class InertialDynamics(AbstractDynamics):
         shares = bodies / bodies.sum(dim=-1, keepdim=True).clamp(min=1)
         with torch.no_grad():
             centers = equidistant_centers(seen.positions, seen.normals, shares, self.extent_weight)
-            shapes = torch.zeros_like(centers)[..., None].repeat(1, 1, 1, 3)
+            shapes = centers.new_zeros(*centers.shape, 3)
             if self.round_contact:
                 centers, shapes = fit_ellipsoids(seen.positions, seen.normals, bodies, centers)
             static_index, static_mask = gather_index(current.mask & ~movable(current))

@@ -258,10 +258,6 @@ def on_feet(contacts: Contacts, points: ContactPoints, far: float) -> Contacts:
     covered[:, feet.slots] = False
     found = [
         torch.cat([values[:, : feet.first], own, values[:, feet.slots.stop :]], dim=1)
-        for values, own in zip(_parts(contacts), _parts(feet.contacts), strict=True)
+        for values, own in zip(contacts.parts(), feet.contacts.parts(), strict=True)
     ]
     return Contacts(found[0].masked_fill(covered, far), found[1] * ~covered[..., None], found[2])
-
-
-def _parts(contacts: Contacts) -> tuple[Tensor, Tensor, Tensor]:
-    return contacts.distances, contacts.normals, contacts.lateral

@@ -116,7 +116,7 @@ def _of_some(
 def _from_neighbors(
     statics: tuple[Tensor, Tensor, Tensor], spacing: Float[Tensor, " batch"], outward: Tensor, ends: Tensor, some: slice
 ) -> tuple[Float[Tensor, "batch some 3"], Float[Tensor, "batch some"]]:
-    """Return edges of some of the particles, with that of the nearest one near an edge where they have none."""
+    """Return the edges that some of the particles share with those around, as far as these agree with the nearest."""
     positions, normals = statics[0], statics[1][:, some]
     offsets = positions[:, None] - positions[:, some, None]
     heights = (offsets * normals[:, :, None]).sum(dim=-1)
