@@ -30,6 +30,11 @@ class PlacedBody:
         return float(np.hypot(*self.half_sizes[:2])) if self.shape == "box" else float(self.half_sizes[:2].max())
 
     @property
+    def rolls(self) -> bool:
+        """Whether it rolls on from where it is pushed to."""
+        return self.shape in ("sphere", "capsule", "ellipsoid")
+
+    @property
     def mjcf_size(self) -> NDArray[np.float64]:
         """Size as MJCF has it for the shape."""
         half = self.half_sizes

@@ -84,6 +84,11 @@ class PushingWorld:
         return self._pushing.data.qpos[:-2].reshape(-1, 7)[:, :3].copy()
 
     @property
+    def reaches(self) -> NDArray[np.float64]:
+        """Farthest distance of each body from its upright axis at first (body,), metres."""
+        return np.array([body.reach for body in self.bodies])
+
+    @property
     def poses(self) -> NDArray[np.float64]:
         """Place and quaternion (w, x, y, z) of each body (body, 7)."""
         return self._pushing.data.qpos[:-2].reshape(-1, 7).copy()

@@ -7,6 +7,7 @@ import torch
 
 from tests.test_actions import motion, scene_of, simulator
 from vpd_lightning.errors import ActionError
+from vpd_lightning.planning.bodies import Body
 from vpd_lightning.planning.costs import TargetPlace
 from vpd_lightning.planning.plan import plan
 from vpd_lightning.planning.solvers import CrossEntropy, RandomShooting
@@ -24,7 +25,7 @@ def given():
     chosen = scene.current.mask[0]
     here = scene.current.positions[0, chosen].mean(dim=0)
     goal = here[:2] + torch.tensor([0.15, -0.1]).double()
-    return model, scene, TargetPlace(chosen, goal, axes=(0, 1)), here
+    return model, scene, TargetPlace(Body.of(scene.current, chosen), goal, axes=(0, 1)), here
 
 
 def test_a_plan_comes_near_its_goal_and_says_what_is_expected(given) -> None:
@@ -35,7 +36,7 @@ def test_a_plan_comes_near_its_goal_and_says_what_is_expected(given) -> None:
     assert found.cost < 0.5 * start and len(found.states) == 6 and found.motion.positions.shape[0] == 6
     assert found.actions.shape == (3, 2) and found.num_candidates == 48
     assert float(cost(found.states)) == pytest.approx(found.cost, abs=1e-6), "the states are those of the plan"
-    reached = found.states[-1].positions[0, cost.chosen].mean(dim=0)
+    reached = found.states[-1].positions[0, cost.body.chosen].mean(dim=0)
     assert torch.allclose(
         reached - here, (found.motion.positions[-1] - scene.current.driven.positions[0])[0], atol=1e-6
     )

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from vpd_lightning.planning.costs import ChamferToCloud, NearTool, OutOfRegion, Sum, TargetPlace, TargetPose
+from vpd_lightning.planning.bodies import Body
+from vpd_lightning.planning.costs import BehindBody, ChamferToCloud, NearTool, OutOfRegion, Sum, TargetPlace, TargetPose
 from vpd_lightning.planning.tasks import KINDS, PLACE_TOLERANCE, ROOM_RADIUS, Task, draw_task
 from vpd_lightning.planning.tool import PlanarTool
 from vpd_lightning.types import Driven, Particles
@@ -40,6 +41,15 @@ def test_from_outside_the_limits_it_may_come_back() -> None:
     assert away == pytest.approx(0.5) and back == pytest.approx(0.44)
 
 
+def test_a_tool_that_lags_is_where_it_was_commanded_to_be_some_of_a_step_ago() -> None:
+    slow, commanded = replace(TOOL, lag=0.25), torch.tensor([0.105, 0.0])
+    motion = slow.motion(driven(), torch.tensor([[[1.0, 0.0]]]), commanded)
+    middles = motion.positions[0].mean(dim=1)[:, 0]
+    assert torch.allclose(middles, 0.105 + torch.tensor([0.015, 0.035, 0.055]), atol=1e-6)
+    with pytest.raises(ValueError, match="lag must lie"):
+        replace(TOOL, lag=2.0)
+
+
 @pytest.mark.parametrize("change", [{"max_speed": 0}, {"hold": 0}, {"low": (0.4, 0.0)}], ids=str)
 def test_limits_that_make_no_sense_are_refused(change: dict) -> None:
     with pytest.raises(ValueError, match="max_speed must be positive"):
@@ -47,6 +57,7 @@ def test_limits_that_make_no_sense_are_refused(change: dict) -> None:
 
 
 CHOSEN = torch.tensor([True, True, False])
+BODY = Body(CHOSEN, torch.tensor([[-0.01, 0, 0], [0.01, 0, 0]]), torch.zeros(3), radius=0.03)
 
 
 def states(*middles: tuple[float, float]) -> list[Particles]:
@@ -59,7 +70,7 @@ def states(*middles: tuple[float, float]) -> list[Particles]:
 
 
 def test_costs_are_distances_at_the_end_and_a_little_of_the_way() -> None:
-    place = TargetPlace(CHOSEN, torch.tensor([0.0, 0.0]), axes=(0, 1))
+    place = TargetPlace(BODY, torch.tensor([0.0, 0.0]), axes=(0, 1))
     assert place(states((0.3, 0.0), (0.1, 0.0))).item() == pytest.approx(0.1 + 0.1 * 0.2, abs=1e-6)
     pose = TargetPose(CHOSEN, torch.tensor([[0.09, 0, 0], [0.11, 0, 0]]))
     assert pose(states((0.1, 0.0))).item() == pytest.approx(0, abs=1e-6)
@@ -69,7 +80,7 @@ def test_costs_are_distances_at_the_end_and_a_little_of_the_way() -> None:
 
 
 def test_a_region_costs_as_much_as_the_shortest_way_out() -> None:
-    bodies, middle = CHOSEN[None], torch.zeros(2)
+    bodies, middle = [BODY], torch.zeros(2)
     disc = OutOfRegion(bodies, middle, torch.tensor([0.1]))
     assert disc(states((0.04, 0.03))).item() == pytest.approx(0.05 * 1.1, abs=1e-6)
     assert disc(states((0.2, 0.0))).item() == 0
@@ -85,20 +96,34 @@ def test_a_cloud_costs_its_chamfer_distance() -> None:
     assert cost(states((0.1, 0.05))).item() == pytest.approx(0.05, abs=1e-6)
 
 
+def test_what_rolls_on_is_not_there_yet() -> None:
+    place = TargetPlace(BODY, torch.tensor([0.0, 0.0]), axes=(0, 1), stopping=4)
+    assert place(states((0.02, 0.0), (0.0, 0.0))).item() == pytest.approx(4 * 0.02 + 0.1 * 0.01, abs=1e-6)
+    assert place(states((0.0, 0.0), (0.0, 0.0))).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_the_tool_is_led_to_the_far_side_of_a_body() -> None:
+    behind = BehindBody(BODY, torch.tensor([-1.0, 0.0]), 0.5)  # the tool's radius is 1 cm, and it is at x = 0.1
+    assert behind(states((0.06, 0.0))).item() == pytest.approx(0, abs=1e-6)
+    assert behind(states((0.14, 0.0))).item() == pytest.approx(0.5 * 0.08, abs=1e-6)
+
+
 def test_the_tool_is_led_to_the_body_and_costs_add_up() -> None:
-    near = NearTool(CHOSEN, 0.5)
+    near = NearTool(BODY, 0.5)
     assert near(states((0.5, 0.0), (0.3, 0.0), (0.4, 0.0))).item() == pytest.approx(0.5 * 0.2, abs=1e-6)
-    place = TargetPlace(CHOSEN, torch.tensor([0.0, 0.0]), axes=(0, 1))
+    place = TargetPlace(BODY, torch.tensor([0.0, 0.0]), axes=(0, 1))
     both = Sum([near, place])(states((0.3, 0.0)))
     assert both.item() == pytest.approx(0.1 + 0.33, abs=1e-6)
 
 
 def test_a_cost_about_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="none is chosen"):
-        TargetPlace(~torch.ones(3, dtype=torch.bool), torch.zeros(3))(states((0.0, 0.0)))
+        TargetPose(~torch.ones(3, dtype=torch.bool), torch.zeros(0, 3))(states((0.0, 0.0)))
+    with pytest.raises(ValueError, match="none is chosen"):
+        Body.of(states((0.0, 0.0))[0], ~torch.ones(3, dtype=torch.bool))
     bare = [replace(state, driven=None) for state in states((0.0, 0.0))]
     with pytest.raises(ValueError, match="nothing that is driven"):
-        NearTool(CHOSEN, 1.0)(bare)
+        NearTool(BODY, 1.0)(bare)
 
 
 def test_doing_nothing_solves_no_task_and_the_goal_does() -> None:
@@ -123,5 +148,5 @@ def test_the_cost_of_a_task_falls_towards_its_goal(kind: str) -> None:
     task = Task(kind, np.array([0.2, 0.0]), HALF_SIZE)  # type: ignore[arg-type]
     toward = {"place": (0.15, 0.05), "off_table": (0.05, 0.34), "make_room": (0.28, 0.0)}[kind]
     start = {"place": (0.05, 0.0), "off_table": (0.05, 0.2), "make_room": (0.21, 0.0)}[kind]
-    cost = task.cost([CHOSEN])
+    cost = task.cost([BODY])
     assert cost(states(toward)).item() < cost(states(start)).item()

@@ -123,7 +123,9 @@ def _loop(config: Mapping[str, Any], settings: Any) -> Any:
     except ValueError as error:
         raise ConfigError(f"{error}.\nCorrect the solver's settings.") from error
     limit = (np.asarray(settings.table.half_size) + settings.pusher.overhang).tolist()
-    tool = PlanarTool(config["max_speed"] * settings.frame_time, [-x for x in limit], limit, config["hold"])
+    # Position control follows a moving place by damping over stiffness (seconds).
+    lag = min(1.0, settings.pusher.damping / settings.pusher.stiffness / settings.frame_time)
+    tool = PlanarTool(config["max_speed"] * settings.frame_time, [-x for x in limit], limit, config["hold"], lag)
     return Loop(tool, solver, config["num_knots"], config["num_executed"], config["num_decisions"])
 
 

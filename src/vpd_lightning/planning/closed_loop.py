@@ -7,11 +7,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vpd_lightning.editing.clusters import object_clusters
+from vpd_lightning.planning.bodies import Body, find_bodies
 from vpd_lightning.planning.plan import Plan, plan
 from vpd_lightning.planning.solvers import Solution, Solver
 from vpd_lightning.planning.tasks import Task
@@ -20,9 +19,6 @@ from vpd_lightning.simulator import Scene, Simulator
 from vpd_lightning.types import Cameras, Driven, Particles
 
 Progress = Callable[[int, int, float], None]
-
-_LOST = 0.08
-"""Metres from where a body was expected within which particles stand for it where no cluster is found."""
 
 
 @runtime_checkable
@@ -53,6 +49,8 @@ class TrueWorld(World, Protocol):
 
     @property
     def places(self) -> NDArray[np.float64]: ...
+    @property
+    def reaches(self) -> NDArray[np.float64]: ...
     @property
     def pusher(self) -> NDArray[np.float64]: ...
     @property
@@ -113,8 +111,8 @@ def run_with_model(
         now = world.observe()
         began = time.perf_counter()
         scene = _encoded(simulator, world, before, now, input_views)
-        bodies = _bodies(scene.current, expected)
-        expected = _middles(scene.current, bodies)
+        bodies = find_bodies(scene.current, expected)
+        expected = torch.stack([body.middle for body in bodies]).cpu()
         if task.seems_solved(expected.numpy()):
             start = None
             _note(episode, world, now, None, 0.0)
@@ -129,10 +127,11 @@ def run_with_model(
             num_knots=loop.num_knots,
             start=start,
             seed=seed + decision,
+            commanded=torch.from_numpy(world.command),
         )
         episode.seconds.append(time.perf_counter() - began)
         start = found.later(loop.num_executed)
-        expected = _middles(found.states[episode.num_steps - 1], bodies)
+        expected = torch.cat([body.middles(found.states[episode.num_steps - 1 :][:1])[:, 0] for body in bodies]).cpu()
         _note(episode, world, now, found, found.cost)
         if progress is not None:
             progress(decision, loop.num_decisions, found.cost)
@@ -148,7 +147,6 @@ def run_with_truth(world: TrueWorld, task: Task, loop: Loop, seed: int = 0) -> E
     As with a model, the tool stays while the task seems solved.
     """
     episode, start = Episode(), torch.zeros(loop.num_knots, 2)
-    chosen = [torch.arange(len(world.places)) == number for number in range(len(world.places))]
     world.advance(world.command[None])
     for decision in range(loop.num_decisions):
         if task.seems_solved(world.places):
@@ -157,7 +155,7 @@ def run_with_truth(world: TrueWorld, task: Task, loop: Loop, seed: int = 0) -> E
             world.advance(np.repeat(world.command[None], loop.num_executed * loop.tool.hold, axis=0))
             continue
         began = time.perf_counter()
-        cost = task.cost(chosen)
+        cost = task.cost(_true_bodies(world))
 
         def evaluate(candidates: Tensor) -> Tensor:
             return cost(_tried(world, loop.tool.path(torch.from_numpy(world.command).float(), candidates)))  # noqa: B023
@@ -185,11 +183,6 @@ def _act(world: World, goals: NDArray[np.float64]) -> Moment:
     return before
 
 
-def _middles(state: Particles, bodies: list[Bool[Tensor, " particle"]]) -> Tensor:
-    """Return the middle of each body's particles (body, 3), metres."""
-    return torch.stack([state.positions[0, chosen].double().mean(dim=0).cpu() for chosen in bodies])
-
-
 def _note(episode: Episode, world: TrueWorld, moment: Moment | None, found: Plan | None, cost: float) -> None:
     episode.costs.append(cost)
     episode.places.append(world.places)
@@ -214,21 +207,14 @@ def _encoded(simulator: Simulator, world: World, before: Moment, now: Moment, vi
     return simulator.encode(rgb, depth, cameras, driven=driven)
 
 
-def _bodies(particles: Particles, expected: Tensor) -> list[Bool[Tensor, " particle"]]:
-    """Return the particles of each body, known by where it is expected: those of the nearest cluster, near as it is."""
-    labels = object_clusters(particles)
-    positions, mask = particles.positions[0].double().cpu(), particles.mask[0].cpu()
-    numbers = [int(number) for number in labels.unique() if number >= 0]
-    middles = torch.stack([positions[labels.cpu() == number].mean(dim=0) for number in numbers]) if numbers else None
-    found = []
-    for place in expected:
-        gaps = None if middles is None else (middles - place).norm(dim=-1)
-        if gaps is not None and float(gaps.min()) < _LOST:
-            found.append(labels.cpu() == numbers[int(gaps.argmin())])
-            continue
-        distances = (positions - place).norm(dim=-1).masked_fill(~mask, torch.inf)
-        found.append(distances <= max(float(distances.min()), 1e-9))
-    return found
+def _true_bodies(world: TrueWorld) -> list[Body]:
+    """Return the bodies of ``_tried``: each is one particle."""
+    places = torch.from_numpy(world.places).float()
+    numbers = torch.arange(len(places))
+    return [
+        Body(numbers == number, place[None], place, float(reach))
+        for number, (place, reach) in enumerate(zip(places, world.reaches, strict=True))
+    ]
 
 
 def _tried(world: TrueWorld, paths: Tensor) -> list[Particles]:
@@ -244,12 +230,14 @@ def _tried(world: TrueWorld, paths: Tensor) -> list[Particles]:
             steps[-1].append(trial.places)
             pushers[-1].append(trial.pusher)
     places, tools = (torch.from_numpy(np.array(part)).float() for part in (steps, pushers))
-    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(places), 1, 3)
+    surface = torch.from_numpy(world.pusher_surface(np.zeros(3))[0]).float()
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(places), len(surface), 3)
+    part = torch.zeros(len(places), len(surface), dtype=torch.int64)
     return [
         Particles(
             positions=places[:, step],
             features=torch.zeros_like(places[:, step, :, :1]),
-            driven=Driven(tools[:, step, None], up, torch.zeros(len(places), 1, dtype=torch.int64)),
+            driven=Driven(tools[:, step, None] + surface, up, part),
         )
         for step in range(places.shape[1])
     ]

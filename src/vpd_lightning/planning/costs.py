@@ -1,7 +1,8 @@
 """What a plan should reach, measured on predicted particles. Costs are in metres: less is better, 0 is reached.
 
 A cost is called with the predicted states (``Particles`` with a batch of candidates, one for each step) and returns a
-number for each candidate. ``chosen`` says which particles it is about (``particle``, of those in the scene).
+number for each candidate. It is about a ``Body``, or about particles that are ``chosen`` (``particle``, of those in the
+scene).
 """
 
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vpd_lightning.planning.bodies import Body
 from vpd_lightning.types import Particles
 
 Cost = Callable[[Sequence[Particles]], Float[Tensor, " batch"]]
@@ -44,30 +46,34 @@ class TargetPose:
 
 @dataclass(frozen=True)
 class TargetPlace:
-    """The middle of a body's particles should be at ``goal`` (metres), however it is turned.
+    """The middle of a body should be at ``goal`` (metres), however it is turned.
 
-    ``axes`` are those that count: (0, 1) leaves the height open.
+    ``axes`` are those that count: (0, 1) leaves the height open. What rolls is not there to stay: its last velocity
+    counts as the distance that it makes in ``stopping`` steps.
     """
 
-    chosen: Bool[Tensor, " particle"]
+    body: Body
     goal: Float[Tensor, " axis"]
     axes: tuple[int, ...] = (0, 1, 2)
+    stopping: float = 0.0
 
     def __call__(self, states: Sequence[Particles]) -> Float[Tensor, " batch"]:
         """Return the cost of each candidate."""
-        middles = _places(states, self.chosen).mean(dim=2)[..., list(self.axes)]
-        return _at_the_end((middles - self.goal.to(middles)).norm(dim=-1))
+        middles = self.body.middles(states)[..., list(self.axes)]
+        cost = _at_the_end((middles - self.goal.to(middles)).norm(dim=-1))
+        if self.stopping and len(states) > 1:
+            cost = cost + self.stopping * (middles[:, -1] - middles[:, -2]).norm(dim=-1)
+        return cost
 
 
 @dataclass(frozen=True)
 class OutOfRegion:
     """Bodies should leave a disc or, where ``half_size`` has two numbers, a rectangle about ``middle`` (x and y).
 
-    For each body in ``bodies`` (rows of chosen particles): how deep its middle is inside, by the shortest way out, and
-    0 outside by ``margin`` (metres) or more.
+    For each body: how deep its middle is inside, by the shortest way out, and 0 outside by ``margin`` (metres) or more.
     """
 
-    bodies: Bool[Tensor, "body particle"]
+    bodies: Sequence[Body]
     middle: Float[Tensor, "2"]
     half_size: Float[Tensor, " size"]
     margin: float = 0.0
@@ -75,8 +81,8 @@ class OutOfRegion:
     def __call__(self, states: Sequence[Particles]) -> Float[Tensor, " batch"]:
         """Return the cost of each candidate: the sum over the bodies."""
         total = []
-        for chosen in self.bodies:
-            away = _places(states, chosen).mean(dim=2)[..., :2]
+        for body in self.bodies:
+            away = body.middles(states)[..., :2]
             away = away - self.middle.to(away)
             if len(self.half_size) == 1:
                 inside = self.half_size[0].to(away) - away.norm(dim=-1)
@@ -103,19 +109,47 @@ class ChamferToCloud:
 
 @dataclass(frozen=True)
 class NearTool:
-    """The tool should come near some particles, so that a plan that is still far from touching them is led there.
+    """The tool should come near a body, so that a plan that is still far from touching it is led there.
 
-    ``weight`` times the distance of the tool's nearest point from the nearest of them, at the step where it is least.
+    ``weight`` times the distance in the plane between both middles, at the step where it is least.
     """
 
-    chosen: Bool[Tensor, " particle"]
+    body: Body
     weight: float
 
     def __call__(self, states: Sequence[Particles]) -> Float[Tensor, " batch"]:
         """Return the cost of each candidate."""
-        places = _places(states, self.chosen).mean(dim=2)
+        places = self.body.middles(states)
         tools = torch.stack([_tool_middle(state) for state in states], dim=1)
         return self.weight * (places - tools)[..., :2].norm(dim=-1).amin(dim=1)
+
+
+@dataclass(frozen=True)
+class BehindBody:
+    """The tool should come to where it can push a body towards ``goal`` (metres, x and y): to its far side.
+
+    ``weight`` times the distance in the plane from there, at the step where it is least.
+    """
+
+    body: Body
+    goal: Float[Tensor, "2"]
+    weight: float
+
+    def __call__(self, states: Sequence[Particles]) -> Float[Tensor, " batch"]:
+        """Return the cost of each candidate."""
+        places = self.body.middles(states)[..., :2]
+        tools = torch.stack([_tool_middle(state) for state in states], dim=1)[..., :2]
+        way = self.goal.to(places) - places
+        way = way / way.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        reach = self.body.radius + _tool_radius(states[0])
+        return self.weight * (places - reach * way - tools).norm(dim=-1).amin(dim=1)
+
+
+def _tool_radius(state: Particles) -> float:
+    """Return half of the tool's widest extent in the plane (metres)."""
+    assert state.driven is not None
+    points = state.driven.positions[0][state.driven.mask[0], :2]
+    return float((points.amax(dim=0) - points.amin(dim=0)).max()) / 2
 
 
 def _tool_middle(state: Particles) -> Float[Tensor, "batch 3"]:

@@ -47,11 +47,13 @@ def plan(
     num_knots: int,
     start: Float[Tensor, "knot 2"] | None = None,
     seed: int = 0,
+    commanded: Float[Tensor, "2"] | None = None,
     progress: Progress | None = None,
 ) -> Plan:
     """Return the best of the solver's candidates of ``num_knots`` actions for an encoded scene.
 
-    ``start`` are actions to begin with (``Plan.later`` of the plan before); without, the tool stays.
+    ``start`` are actions to begin with (``Plan.later`` of the plan before); without, the tool stays. ``commanded`` is
+    where the tool was last commanded to be (metres); without, it is there.
 
     Raises:
         ActionError: nothing in the scene is driven.
@@ -70,7 +72,7 @@ def plan(
 
     def evaluate(candidates: Tensor) -> Tensor:
         nonlocal done, least
-        states = simulator.rollout(scene, num_knots * tool.hold, driven=tool.motion(driven, candidates))
+        states = simulator.rollout(scene, num_knots * tool.hold, driven=tool.motion(driven, candidates, commanded))
         costs = cost(states)
         done, least = done + len(candidates), min(least, float(costs.min()))
         if progress is not None:
@@ -79,7 +81,7 @@ def plan(
 
     with torch.no_grad():
         found = solver.solve(evaluate, first.to(driven.positions), seed)
-        motion = tool.motion(driven, found.actions[None])
+        motion = tool.motion(driven, found.actions[None], commanded)
         states = simulator.rollout(scene, num_knots * tool.hold, driven=motion)
     return Plan(
         actions=found.actions.cpu(),

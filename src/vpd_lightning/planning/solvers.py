@@ -90,6 +90,8 @@ class CrossEntropy:
             noise = torch.randn(self.num_samples, *start.shape, generator=draw).to(start)
             candidates = (mean + spread * noise).clamp(-1, 1)
             candidates[0] = mean if best.actions is None else best.actions
+            if best.actions is None and len(candidates) > 1:
+                candidates[1] = 0  # doing nothing, too: what a plan began may be done
             elites = candidates[best(candidates).argsort()[: self.num_elites]]
             mean, spread = elites.mean(dim=0), elites.std(dim=0, correction=0).clamp(min=0.05)
         return best.solution()

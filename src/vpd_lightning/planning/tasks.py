@@ -5,11 +5,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool
 from numpy.typing import NDArray
-from torch import Tensor
 
-from vpd_lightning.planning.costs import Cost, NearTool, OutOfRegion, Sum, TargetPlace
+from vpd_lightning.planning.bodies import Body
+from vpd_lightning.planning.costs import BehindBody, Cost, NearTool, OutOfRegion, Sum, TargetPlace
 
 Kind = Literal["place", "off_table", "make_room"]
 KINDS: tuple[Kind, ...] = ("place", "off_table", "make_room")
@@ -21,6 +20,7 @@ _PUSH = (0.10, 0.16)  # metres, from a body's first place to its goal
 _FROM_EDGE = 0.08  # metres, of a goal
 _MARGIN = 0.02  # metres, by which plans leave a region, and observed bodies must be where they should
 _APPROACH = 0.3  # of the distance between tool and body, beside the cost of the task
+_STOPPING = 4.0  # steps at its last velocity that a body at its place still seems away from it
 _MAX_TRIALS = 1000
 
 
@@ -64,15 +64,17 @@ class Task:
         inside = ROOM_RADIUS - np.hypot(*(places[:, :2] - self.goal).T)
         return float(np.where(places[:, 2] > FALLEN, inside.clip(min=0), 0.0).sum())
 
-    def cost(self, bodies: list[Bool[Tensor, " particle"]]) -> Cost:
-        """Return what a plan should lower; ``bodies`` are the particles of each body, first of the one to be moved."""
+    def cost(self, bodies: list[Body]) -> Cost:
+        """Return what a plan should lower; the first of the bodies is the one to be moved."""
         goal = torch.from_numpy(self.goal)
         near = NearTool(bodies[0], _APPROACH)
         if self.kind == "place":
-            return Sum([TargetPlace(bodies[0], goal, axes=(0, 1)), near])
+            return Sum(
+                [TargetPlace(bodies[0], goal, axes=(0, 1), stopping=_STOPPING), BehindBody(bodies[0], goal, _APPROACH)]
+            )
         if self.kind == "off_table":
-            return Sum([OutOfRegion(bodies[0][None], 0 * goal, torch.from_numpy(self.half_size), 2 * _MARGIN), near])
-        return Sum([OutOfRegion(torch.stack(bodies), goal, torch.tensor([ROOM_RADIUS]), _MARGIN), near])
+            return Sum([OutOfRegion(bodies[:1], 0 * goal, torch.from_numpy(self.half_size), 2 * _MARGIN), near])
+        return Sum([OutOfRegion(bodies, goal, torch.tensor([ROOM_RADIUS]), _MARGIN), near])
 
 
 def draw_task(

@@ -16,15 +16,19 @@ class PlanarTool:
     """A rigid tool, its limits and how an action is held.
 
     An action is a velocity along the world's x and y, in shares of ``max_speed`` (metres per step), and is held for
-    ``hold`` steps. The mean of the tool's points stays between ``low`` and ``high`` (metres, x and y).
+    ``hold`` steps. The mean of the tool's points stays between ``low`` and ``high`` (metres, x and y). Where position
+    control follows what is commanded by some of a step later, ``lag`` says by how much of it (0 to 1).
     """
 
     max_speed: float
     low: Sequence[float]
     high: Sequence[float]
     hold: int
+    lag: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.lag <= 1:
+            raise ValueError(f"lag must lie between 0 and 1 step, got {self.lag}")
         if self.max_speed <= 0 or self.hold < 1 or any(a >= b for a, b in zip(self.low, self.high, strict=True)):
             raise ValueError(
                 f"max_speed must be positive, hold at least 1 and low below high, got {self.max_speed}, {self.hold}, "
@@ -32,7 +36,7 @@ class PlanarTool:
             )
 
     def path(self, start: Float[Tensor, "2"], actions: Float[Tensor, "batch knot 2"]) -> Float[Tensor, "batch step 2"]:
-        """Return where the tool's middle is after each step, within the limits of speed and place."""
+        """Return where to command the tool's middle after each step, within the limits of speed and place."""
         speed = actions.norm(dim=-1, keepdim=True).clamp(min=1e-9)
         velocities = self.max_speed * actions * (1 / speed).clamp(max=1)
         low, high = (torch.as_tensor(end).to(start) for end in (self.low, self.high))
@@ -65,10 +69,20 @@ class PlanarTool:
         """Return where the middle of the tool's points is now, x and y (batch axis of 1)."""
         return driven.positions[0][driven.mask[0], :2].mean(dim=0)
 
-    def motion(self, driven: Driven, actions: Float[Tensor, "batch knot 2"]) -> Driven:
-        """Return the motion (axes ``batch step driven``) of a tool that is at ``driven`` now (batch axis of 1)."""
-        start = self.middle(driven)
-        return self._carried(driven, self.path(start, actions.to(start)))
+    def motion(
+        self,
+        driven: Driven,
+        actions: Float[Tensor, "batch knot 2"],
+        commanded: Float[Tensor, "2"] | None = None,
+    ) -> Driven:
+        """Return the motion (axes ``batch step driven``) of a tool that is at ``driven`` now (batch axis of 1).
+
+        ``commanded`` is where it was last told to be; without, it is there.
+        """
+        start = self.middle(driven) if commanded is None else commanded.to(driven.positions)
+        commands = self.path(start, actions.to(start))
+        before = torch.cat([start.expand(len(commands), 1, 2), commands[:, :-1]], dim=1)
+        return self._carried(driven, torch.lerp(commands, before, self.lag))
 
     def _carried(self, driven: Driven, places: Float[Tensor, "batch step 2"]) -> Driven:
         """Return the tool at each place of its middle (axes ``batch step driven``)."""

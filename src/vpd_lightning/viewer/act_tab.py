@@ -12,6 +12,7 @@ from torch import Tensor
 
 from vpd_lightning.editing.operations import Operation
 from vpd_lightning.errors import ActionError
+from vpd_lightning.planning.bodies import Body
 from vpd_lightning.planning.costs import NearTool, Sum, TargetPlace
 from vpd_lightning.planning.plan import plan
 from vpd_lightning.planning.solvers import CrossEntropy
@@ -176,11 +177,12 @@ class ActTab:
                 raise _Superseded
             self._say(f"Planning: {done} of {total} futures tried.")
 
+        body = Body.of(rollout.editor.scene.current, chosen)
         try:
             found = plan(
                 self.panel.opened.simulator,
                 rollout.editor.scene,
-                Sum([TargetPlace(chosen, torch.from_numpy(goal[:2]), axes=(0, 1)), NearTool(chosen, _APPROACH)]),
+                Sum([TargetPlace(body, torch.from_numpy(goal[:2]), axes=(0, 1)), NearTool(body, _APPROACH)]),
                 tool=tool,
                 solver=CrossEntropy(count, _NUM_ITERATIONS, max(1, round(_ELITE_SHARE * count)), _SPREAD),
                 num_knots=int(self.knots.value),
@@ -188,8 +190,7 @@ class ActTab:
             )
         except _Superseded:
             return
-        places = found.states[-1].positions[0][chosen.to(found.states[-1].positions.device)].double().mean(dim=0)
-        away = float(np.hypot(*(places.cpu().numpy() - goal)[:2]))
+        away = float(np.hypot(*(body.middles(found.states[-1:])[0, 0].double().cpu().numpy() - goal)[:2]))
         self.stops = []
         self._drive(found.motion, "does what was planned")
         self._say(f"Expected to end {100 * away:.1f} cm from the goal, after {found.num_candidates} futures tried.")

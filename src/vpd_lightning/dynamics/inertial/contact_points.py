@@ -50,11 +50,14 @@ def pushed_surface(positions: Float[Tensor, "batch moving 3"], memory: InertialM
     """Return all that may be pushed: the particles of bodies and, where they are guessed, their mirror images."""
     centers = vectors_of(memory.motion.centers, memory.own)
     facing = memory.mask & (memory.normals.square().sum(dim=-1) > 0.5)
+    sizes = body_sizes(memory)
+    lengths = (positions - centers).detach().square().sum(dim=-1) * facing
+    radii = torch.zeros_like(sizes).scatter_reduce(1, memory.own, lengths, "amax").sqrt()
     parts = [(positions, memory.normals, memory.own, facing)]
     if is_mirrored:
         parts.append((2 * centers - positions, -memory.normals, memory.own, facing & memory.mirrored))
     places, normals, own, usable = (torch.cat(each, dim=1) for each in zip(*parts, strict=True))
-    return Surface(places, normals, own, usable, memory.spacing, body_sizes(memory))
+    return Surface(places, normals, own, usable, memory.spacing, sizes, radii)
 
 
 def body_sizes(memory: InertialMemory) -> Float[Tensor, "batch body"]:

@@ -51,6 +51,7 @@ class Surface:
     is_usable: Bool[Tensor, "batch point"]
     spacing: Float[Tensor, " batch"]
     sizes: Float[Tensor, "batch body"]  # metres
+    radii: Float[Tensor, "batch body"]  # metres, of the spheres about their centres that hold all usable points
 
 
 @dataclass(frozen=True)
@@ -181,8 +182,8 @@ def _met_by_driven(
 ) -> tuple[Tensor, Tensor]:
     """Return the surface point whose tangent plane each driven point meets, and whether it meets one in this step.
 
-    With a ``margin`` (spacings of the driven points) it is enough to come that near. Members of the batch whose boxes
-    are farther apart than that are not looked at.
+    With a ``margin`` (spacings of the driven points) it is enough to come that near. Members of the batch in which
+    nothing is near are not looked at.
     """
     target, is_met = torch.zeros_like(bodies.groups), torch.zeros_like(bodies.mask)
     count = len(is_met)
@@ -196,22 +197,33 @@ def _met_by_driven(
 
 
 def _may_meet(bodies: DrivenBodies, surface: Surface, motion: BodyMotion, margin: float) -> Bool[Tensor, " batch"]:
-    """Return in which members the boxes around both, swept in the step, are as near as points must be to meet."""
-    farthest = torch.maximum(margin * bodies.spacing, surface.sizes.amax(dim=1) / 3)
-    reach = (_REACH * surface.spacing + margin * bodies.spacing + farthest)[:, None]
-    there = motion.carried(surface.positions, surface.own)
-    low, high = _box(torch.cat([surface.positions, there], dim=1), surface.is_usable.repeat(1, 2))
-    moved = torch.cat([bodies.positions, bodies.positions + bodies.displacements], dim=1)
-    driven_low, driven_high = _box(moved, bodies.mask.repeat(1, 2))
-    apart = torch.maximum(low - driven_high, driven_low - high)
-    return (apart <= reach).all(dim=-1)
+    """Return in which members a body's sphere comes as near to the box around what is driven as points must to meet.
+
+    Both are those of the whole step.
+    """
+    deformation = motion.deformation()
+    turned = motion.spins.norm(dim=-1) * deformation.flatten(2).norm(dim=-1)
+    stretched = (deformation - torch.eye(3).to(deformation)).flatten(2).norm(dim=-1)
+    reach = surface.radii * (1 + turned + stretched) + motion.displacements.norm(dim=-1)
+    low, high = _swept_box(bodies)
+    beyond = torch.maximum(low[:, None] - motion.centers, motion.centers - high[:, None]).clamp(min=0)
+    is_near = beyond.norm(dim=-1) <= reach + _reach(bodies, surface, margin)[:, None]
+    return (is_near & (surface.radii > 0)).any(dim=1)
 
 
-def _box(positions: Tensor, mask: Tensor) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"]]:
-    missing = ~mask[..., None]
+def _reach(bodies: DrivenBodies, surface: Surface, margin: float) -> Float[Tensor, " batch"]:
+    """Return how far apart points may be that meet (metres)."""
+    above = margin * bodies.spacing
+    return _REACH * surface.spacing + above + torch.maximum(above, surface.sizes.amax(dim=1) / 3)
+
+
+def _swept_box(bodies: DrivenBodies) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"]]:
+    """Return the lowest and the highest corner of the box around what is driven, before and after the step."""
+    moved = torch.stack([bodies.positions, bodies.positions + bodies.displacements], dim=1)
+    missing = ~bodies.mask[:, None, :, None]
     return (
-        positions.masked_fill(missing, torch.inf).amin(dim=1),
-        positions.masked_fill(missing, -torch.inf).amax(dim=1),
+        moved.masked_fill(missing, torch.inf).amin(dim=(1, 2)),
+        moved.masked_fill(missing, -torch.inf).amax(dim=(1, 2)),
     )
 
 
@@ -220,6 +232,10 @@ def _met_nearby(bodies: DrivenBodies, surface: Surface, motion: BodyMotion, marg
     moves = motion.carried(surface.positions, surface.own) - surface.positions
     # Each member has a number of parts of its own: a batch equals its members.
     fastest = bodies.displacements.norm(dim=-1).amax(dim=1) + (moves.norm(dim=-1) * surface.is_usable).amax(dim=1)
+    # Points that are farther from the driven ones than this meet none of them, nor hide a nearer one that does.
+    low, high = (corner[:, None] for corner in _swept_box(bodies))
+    far = (_reach(bodies, surface, margin) + fastest)[:, None, None]
+    usable = surface.is_usable & ((surface.positions > low - far) & (surface.positions < high + far)).all(dim=-1)
     smallest = (_STEP_SHARE * surface.sizes.amin(dim=1)).clamp(min=1e-6)
     num_parts = (fastest / smallest).ceil().clamp(1, _MOST_PARTS)[:, None, None]
     target = torch.zeros_like(bodies.groups)
@@ -233,7 +249,7 @@ def _met_nearby(bodies: DrivenBodies, surface: Surface, motion: BodyMotion, marg
             start + part / num_parts * step
             for start, step in ((surface.positions, moves), (bodies.positions, bodies.displacements))
         )
-        index, exists = nearest_usable(queries, places, surface.is_usable)
+        index, exists = nearest_usable(queries, places, usable)
         offsets = queries - vectors_of(places, index) + (bodies.displacements - vectors_of(moves, index)) / num_parts
         height = (offsets * vectors_of(surface.normals, index)).sum(dim=-1)
         beside = offsets.square().sum(dim=-1) - height.square()
