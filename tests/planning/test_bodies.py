@@ -68,7 +68,18 @@ def test_bodies_that_were_clustered_as_one_are_told_apart_by_where_they_are_expe
     assert torch.equal(other.chosen, owner == 2)
 
 
-def test_where_no_cluster_is_near_the_nearest_particle_stands_for_a_body() -> None:
+def test_a_body_that_is_not_where_it_was_expected_is_the_cluster_that_no_other_is() -> None:
+    now = scene(ball((0.0, 0.0, 0.05), upper=True), ball((0.3, 0.0, 0.05), upper=True))
+    first, moved = find_bodies(now, torch.tensor([[0.0, 0.0, 0.05], [0.3, 0.15, 0.05]], dtype=torch.float64))
+    assert int(first.chosen.sum()) == 200 and torch.equal(moved.chosen, torch.arange(400) >= 200)
+
+
+def test_a_body_that_is_not_seen_is_where_it_was_expected() -> None:
     now = scene(ball((0.0, 0.0, 0.05), upper=True))
-    lost = find_bodies(now, torch.tensor([[0.4, 0.0, 0.0]], dtype=torch.float64))[0]
-    assert int(lost.chosen.sum()) == 1
+    fallen = torch.tensor([0.2, 0.0, -0.25], dtype=torch.float64)
+    seen, lost = find_bodies(now, torch.stack([torch.tensor([0.0, 0.0, 0.05], dtype=torch.float64), fallen]))
+    assert int(seen.chosen.sum()) == 200 and int(lost.chosen.sum()) == 1
+    assert torch.equal(lost.middles([now])[0, 0], fallen)
+    beside = torch.tensor([0.07, 0.0, -0.04], dtype=torch.float64)  # of its neighbour no particle is nearer to it
+    seen, lost = find_bodies(now, torch.stack([torch.tensor([0.0, 0.0, 0.05], dtype=torch.float64), beside]))
+    assert int(seen.chosen.sum()) == 200 and torch.equal(lost.middle, beside)

@@ -11,8 +11,9 @@ from vpd_lightning.dynamics.inertial.rigid_motion import rigid_fit
 from vpd_lightning.editing.clusters import object_clusters
 from vpd_lightning.types import Particles
 
-_LOST = 0.08
-"""Metres from where a body was expected within which particles stand for it."""
+_LOST, _FARTHEST = 0.08, 0.25
+"""Metres from where a body was expected: within the first particles are taken for it, within the second where they are
+no other body's."""
 
 
 @dataclass(frozen=True)
@@ -77,37 +78,45 @@ def _hidden_side(particles: Particles, chosen: Bool[Tensor, " particle"]) -> Flo
 def find_bodies(particles: Particles, expected: Float[Tensor, "body 3"]) -> list[Body]:
     """Find the bodies of a scene (batch axis of 1) by where the middle of each is expected (metres).
 
-    Each is the cluster of particles whose middle is nearest; what was clustered as one but is expected to be several
-    bodies is divided among them by the nearer middle. Where no cluster is near, the particle nearest to the place
-    stands for the body.
+    Each is the cluster of particles that is there; one that is not there, the nearest cluster that no other is. What
+    was clustered as one but is expected to be several bodies is divided among them by the nearer middle. A body that
+    is nowhere to be seen is taken to be where it was expected, and one particle stands for it.
     """
     labels = object_clusters(particles).cpu()
     positions, mask = particles.positions[0].double().cpu(), particles.mask[0].cpu()
     expected = expected.double().cpu()
-    names = [_cluster_at(place, labels, positions) for place in expected]
+    names = _clusters_at(expected, labels, positions)
     apart = (positions[:, None] - expected).norm(dim=-1)
     found = []
     for number, name in enumerate(names):
-        if name is None:
-            nearest = apart[:, number].masked_fill(~mask, torch.inf).argmin()
-            chosen = torch.arange(len(positions)) == nearest
-        else:
-            sharing = torch.tensor([other == name for other in names])
-            owner = apart.masked_fill(~sharing, torch.inf).argmin(dim=1)
-            chosen = (labels == name) & (owner == number)
-        found.append(Body.of(particles, chosen))
+        sharing = torch.tensor([other is not None and other == name for other in names])
+        owner = apart.masked_fill(~sharing, torch.inf).argmin(dim=1)
+        chosen = (labels == name) & (owner == number) if name is not None else torch.zeros_like(mask)
+        if bool(chosen.any()):
+            found.append(Body.of(particles, chosen))
+            continue
+        nearest = apart[:, number].masked_fill(~mask, torch.inf).argmin()
+        chosen = (torch.arange(len(positions)) == nearest).to(particles.positions.device)
+        found.append(Body(chosen, particles.positions[0, chosen], expected[number].to(particles.positions)))
     return found
 
 
-def _cluster_at(place: Tensor, labels: Tensor, positions: Tensor) -> int | None:
-    """Return the cluster whose middle is nearest to a place, else the one that reaches it; None where both are far."""
+def _clusters_at(expected: Tensor, labels: Tensor, positions: Tensor) -> list[int | None]:
+    """Return the cluster at each place; None where there is none left."""
     names = [int(name) for name in labels.unique() if name >= 0]
-    if not names:
-        return None
-    inside = [positions[labels == name] for name in names]
-    gaps = torch.stack([((some.amin(dim=0) + some.amax(dim=0)) / 2 - place).norm() for some in inside])
-    if float(gaps.min()) < _LOST / 2:
-        return names[int(gaps.argmin())]
-    reach = torch.stack([(some - place).norm(dim=-1).min() for some in inside])
-    least = torch.minimum(gaps, reach)
-    return names[int(least.argmin())] if float(least.min()) < _LOST else None
+    inside = {name: positions[labels == name] for name in names}
+    gaps = {name: ((some.amin(dim=0) + some.amax(dim=0)) / 2 - expected).norm(dim=-1) for name, some in inside.items()}
+    reach = {name: torch.cdist(expected, some).amin(dim=1) for name, some in inside.items()}  # noqa: TID251
+    found: list[int | None] = []
+    for number in range(len(expected)):
+        best = min(names, key=lambda name: float(gaps[name][number]), default=None)
+        if best is None or gaps[best][number] > _LOST / 2:  # a merged one reaches there, though its middle is elsewhere
+            best = min(names, key=lambda name: float(torch.minimum(gaps[name], reach[name])[number]), default=None)
+            if best is not None and min(gaps[best][number], reach[best][number]) > _LOST:
+                best = None
+        found.append(best)
+    for number in range(len(expected)):
+        if found[number] is None:
+            free = [name for name in names if name not in found and gaps[name][number] < _FARTHEST]
+            found[number] = min(free, key=lambda name: float(gaps[name][number]), default=None)
+    return found
