@@ -46,7 +46,7 @@ SETTINGS = {
     "workspace_max": None,
     "supported_speed": 0.0,
     "round_contact": False,
-    "damps_spin": True,
+    "is_damped": True,
     "skip_resting": False,
 }
 FIRST_VELOCITY = {

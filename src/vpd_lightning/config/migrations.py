@@ -48,7 +48,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "workspace_max": None,
         "supported_speed": 0.0,
         "round_contact": False,
-        "damps_spin": True,
+        "is_damped": True,
         "skip_resting": False,
     },
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},
@@ -87,6 +87,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
 
 
 REMOVED_SETTINGS: dict[str, dict[str, Any]] = {
+    f"{_DYNAMICS}inertial.InertialDynamics": {"damps_spin": True},
     f"{_RENDERER}point_nerf.PointNeRFRenderer": {
         "early_stop": 0.0,
         "num_stop_segments": ANY_VALUE,  # without effect where early_stop was off

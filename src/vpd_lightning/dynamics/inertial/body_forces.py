@@ -23,8 +23,9 @@ class BodyForces(nn.Module):
     until that is learned, the other forces must not replace it. ``acceleration_gain`` multiplies the learning rate of
     the common acceleration: an update changes three numbers by less than it does the output of a network.
     Damping scales the carried velocity: impacts and friction remove motion
-    in proportion to it. Zero-initialised: no force, hardly any damping (0.7 % a step). Without ``damps_spin`` a spin
-    ends by contact and torque alone: pixels hardly show how a round body turns, and a damped one stops rolling.
+    in proportion to it. Zero-initialised: no force, hardly any damping (0.7 % a step). Without ``is_damped`` motion ends by
+    contact alone: taught by a few steps of pixels, damping makes up for what is not known yet, and slows what rolls and
+    falls later on.
     """
 
     def __init__(
@@ -38,10 +39,9 @@ class BodyForces(nn.Module):
         residual_share: float,
         acceleration_gain: float,
         contact_range: float,
-        damps_spin: bool,
+        is_damped: bool,
     ):
         super().__init__()
-        self.damps_spin = damps_spin
         self.num_forces, self.contact_range = num_forces, contact_range
         self.location_scale, self.force_scale = location_scale, force_scale
         self.residual_scale = residual_share * force_scale
@@ -58,9 +58,9 @@ class BodyForces(nn.Module):
         self.attention = nn.Linear(hidden_dim, num_forces)
         self.force = nn.Linear(hidden_dim, 3 * num_forces)
         self.offset_query = nn.Linear(3, hidden_dim, bias=False)
-        self.damping = nn.Linear(hidden_dim, 2)
+        self.damping = nn.Linear(hidden_dim, 2) if is_damped else None
         self.weight = nn.Linear(hidden_dim, 3)
-        for layer in (self.force, self.damping, self.weight):
+        for layer in filter(None, (self.force, self.damping, self.weight)):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
@@ -161,14 +161,16 @@ class BodyForces(nn.Module):
         push = torch.einsum("bapf,bpfi->bai", attention, forces)
         torque = torch.einsum("bapf,bpfi->bai", attention, cross(offsets[:, :, None].expand_as(forces), forces))
         weight = self.residual_scale * torch.tanh(self.weight(body)) + self.common_acceleration()
-        # Nearly one at initialisation; it may remove motion, never add any: a long rollout cannot feed on itself.
-        keep = torch.sigmoid(self.damping(body) + 5.0)
-        keep_spin = keep[..., 1:] if self.damps_spin else torch.ones_like(keep[..., 1:])
+        displacements, spins = motion.displacements, motion.spins
+        if self.damping is not None:
+            # Nearly one at initialisation; it may remove motion, never add any: a long rollout cannot feed on itself.
+            keep = torch.sigmoid(self.damping(body) + 5.0)
+            displacements, spins = displacements * keep[..., :1], spins * keep[..., 1:]
         weight, torque = weight * there[..., None], torque * there[..., None]
         return replace(
             motion,
-            displacements=motion.displacements * keep[..., :1] + push * there[..., None] + weight,
-            spins=motion.spins * keep_spin + rotate(inertia.inverse_turning, torque),
+            displacements=displacements + push * there[..., None] + weight,
+            spins=spins + rotate(inertia.inverse_turning, torque),
         )
 
 

@@ -124,7 +124,7 @@ class InertialDynamics(AbstractDynamics):
         workspace_max: Sequence[float] | None,
         supported_speed: float,
         round_contact: bool,
-        damps_spin: bool,
+        is_damped: bool,
         skip_resting: bool,
     ):
         super().__init__()
@@ -160,7 +160,7 @@ class InertialDynamics(AbstractDynamics):
             residual_share=residual_share,
             acceleration_gain=acceleration_gain,
             contact_range=contact_range,
-            damps_spin=damps_spin,
+            is_damped=is_damped,
         )
         sizes = {"feature_dim": feature_dim, "hidden_dim": hidden_dim}
         self.materials = MaterialNetwork(**sizes, is_soft=is_soft, max_friction=max_friction)
