@@ -22,10 +22,9 @@ class BodyForces(nn.Module):
     most ``residual_share`` of ``force_scale`` (metres per step squared), which bounds the common acceleration:
     until that is learned, the other forces must not replace it. ``acceleration_gain`` multiplies the learning rate of
     the common acceleration: an update changes three numbers by less than it does the output of a network.
-    Damping scales the carried velocity: impacts and friction remove motion
-    in proportion to it. Zero-initialised: no force, hardly any damping (0.7 % a step). Without ``is_damped`` motion ends by
-    contact alone: taught by a few steps of pixels, damping makes up for what is not known yet, and slows what rolls and
-    falls later on.
+    Damping scales the carried velocity: impacts and friction remove motion in proportion to it. Zero-initialised: no
+    force, hardly any damping (0.7 % a step). Without ``is_damped`` motion ends by contact alone: taught by a few steps
+    of pixels, damping makes up for what is not known yet, and slows what rolls and falls later on.
     """
 
     def __init__(
