@@ -4,10 +4,10 @@
 in closed loop against MuJoCo: ``model`` (cross-entropy method), ``random`` (random shooting with the same number of
 candidates), ``truth`` (the same planner and candidates on the simulator itself, the ceiling) and ``nothing``. Worlds
 and tasks depend on the seed alone (seeds from ``FIRST_SEED`` on, which no data set has; choices were made on seeds from
-1000 on). For ``place`` those worlds count whose first body stays where it is put, a box or a cylinder: the simulator
-itself left three of ten others where they rolled on. Results are added to OUT.json task by task, so a stopped run
-goes on and several may share a file (with the same settings, or they are refused); success rates come with 95 % Wilson
-intervals.
+1000 on). For ``place`` those worlds count whose first body stays where it is put, a box or a cylinder: of ten that roll
+the simulator itself, by the same planner, left four or five where they should be. Results are added to OUT.json task by
+task, so a stopped run goes on and several may share a file (with the same settings, or they are refused); success rates
+come with 95 % Wilson intervals.
 """
 
 import argparse
