@@ -50,8 +50,6 @@ class Body:
 
     def middles(self, states: Sequence[Particles]) -> Float[Tensor, "batch step 3"]:
         """Return where the middle is in predicted states (which have a batch axis)."""
-        if not bool(self.chosen.any()):
-            raise ValueError("a cost needs at least one particle to be about, and none is chosen")
         chosen = self.chosen.to(states[0].positions.device)
         moved = torch.stack([state.positions[:, chosen] for state in states], dim=1)
         places, middle = self.places.to(moved), self.middle.to(moved)

@@ -5,7 +5,9 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 
 from vpd_lightning.planning.bodies import Body
 from vpd_lightning.planning.costs import BehindBody, Cost, NearTool, OutOfRegion, Sum, TargetPlace
@@ -69,12 +71,15 @@ class Task:
         goal = torch.from_numpy(self.goal)
         near = NearTool(bodies[0], _APPROACH)
         if self.kind == "place":
-            return Sum(
-                [TargetPlace(bodies[0], goal, axes=(0, 1), stopping=_STOPPING), BehindBody(bodies[0], goal, _APPROACH)]
-            )
+            return place_cost(bodies[0], goal)
         if self.kind == "off_table":
             return Sum([OutOfRegion(bodies[:1], 0 * goal, torch.from_numpy(self.half_size), 2 * _MARGIN), near])
         return Sum([OutOfRegion(bodies, goal, torch.tensor([ROOM_RADIUS]), _MARGIN), near])
+
+
+def place_cost(body: Body, goal: Float[Tensor, "2"]) -> Cost:
+    """Return what a plan should lower so that a body comes to rest at ``goal`` (metres, x and y)."""
+    return Sum([TargetPlace(body, goal, axes=(0, 1), stopping=_STOPPING), BehindBody(body, goal, _APPROACH)])
 
 
 def draw_task(

@@ -13,9 +13,9 @@ from torch import Tensor
 from vpd_lightning.editing.operations import Operation
 from vpd_lightning.errors import ActionError
 from vpd_lightning.planning.bodies import Body
-from vpd_lightning.planning.costs import NearTool, Sum, TargetPlace
 from vpd_lightning.planning.plan import plan
 from vpd_lightning.planning.solvers import CrossEntropy
+from vpd_lightning.planning.tasks import place_cost
 from vpd_lightning.planning.tool import PlanarTool
 from vpd_lightning.viewer.screen import PICTURE
 from vpd_lightning.viewer.tab_host import TabHost
@@ -23,7 +23,6 @@ from vpd_lightning.viewer.tool_handles import ToolHandles
 
 _HOLD = 4  # steps for which a planned velocity is held
 _NUM_ITERATIONS, _ELITE_SHARE, _SPREAD = 2, 0.125, 0.7
-_APPROACH = 0.3  # of the distance between tool and body, beside that from the goal
 
 
 class _Superseded(Exception):
@@ -182,7 +181,7 @@ class ActTab:
             found = plan(
                 self.panel.opened.simulator,
                 rollout.editor.scene,
-                Sum([TargetPlace(body, torch.from_numpy(goal[:2]), axes=(0, 1)), NearTool(body, _APPROACH)]),
+                place_cost(body, torch.from_numpy(goal[:2])),
                 tool=tool,
                 solver=CrossEntropy(count, _NUM_ITERATIONS, max(1, round(_ELITE_SHARE * count)), _SPREAD),
                 num_knots=int(self.knots.value),
