@@ -78,3 +78,15 @@ def test_without_the_package_mppi_says_how_to_get_it(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "pytorch_mppi", None)
     with pytest.raises(ConfigError, match=r"pip install vpd-lightning\[planning\]"):
         SOLVERS["mppi"].solve(distance, torch.zeros(3, 2), seed=0)
+
+
+def test_the_cross_entropy_method_tries_what_it_starts_from_and_to_do_nothing() -> None:
+    tried: list[Tensor] = []
+
+    def evaluate(candidates: Tensor) -> Tensor:
+        tried.append(candidates.clone())
+        return candidates.square().sum(dim=(1, 2))  # nothing is cheaper than doing nothing
+
+    found = CrossEntropy(num_samples=8, num_iterations=1, num_elites=2, spread=0.7).solve(evaluate, GOAL.clone(), 0)
+    assert torch.equal(tried[0][0], GOAL) and not tried[0][1].any()
+    assert found.cost == 0 and not found.actions.any()

@@ -65,7 +65,8 @@ class _Best:
 class CrossEntropy:
     """Cross-entropy method (Rubinstein 1999): refit a Gaussian to the best candidates, again and again.
 
-    ``spread`` is the first standard deviation, in shares of the range; ``num_elites`` are kept. There is no package on
+    ``spread`` is the first standard deviation, in shares of the range; ``num_elites`` are kept. Of the first candidates
+    one is ``start`` and one is to do nothing. There is no package on
     PyPI that brings it alone; that of stable-worldmodel needs a data base (see ``worldmodel``, the adapter for it).
     """
 
