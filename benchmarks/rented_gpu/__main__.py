@@ -18,7 +18,9 @@ files of 15 MiB and ``curve.json`` in ``--out``, and goes on from there with ``-
 import argparse
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 
@@ -38,7 +40,11 @@ def main(arguments: list[str] | None = None) -> int:
     train.add_argument("--pack", type=Path, required=True)
     train.add_argument("--out", type=Path, required=True)
     train.add_argument("--resume", type=Path, help="folder with the state to go on from")
-    train.add_argument("--minutes", type=float, default=9.0)
+    train.add_argument("--minutes", type=float, default=9.0, help="until it stops")
+    train.add_argument("--minutes-in-all", type=float, help="of all phases, earlier calls counted in; not --updates")
+    train.add_argument("--seed", type=int, help="another one than the pack's")
+    train.add_argument("--clips", type=int, help="of an update of the last training")
+    train.add_argument("--precision", choices=["bf16", "tf32", "float32"], help="another one than the pack's")
     train.add_argument("--save-minutes", type=float, default=2.0)
     train.add_argument("--device", default="cuda")
     train.add_argument("--workers", type=int, default=8, help="processes that draw clips")
@@ -81,6 +87,9 @@ def _pack(options: argparse.Namespace) -> None:
     targets = config["data"]["target_views"]
     targets = list(range(trajectories[0].num_views)) if targets is None else targets
     phases = [_phase(one, count, targets) for one, count in zip(configs, options.updates, strict=True)]
+    first_share = config["pretraining"]["share"] if first else 0.0
+    for phase, share in zip(phases[::-1], (1.0 - first_share, first_share), strict=False):
+        phase["share"] = share
     views = sorted({*config["data"]["input_views"], *targets})
     fitted, size = write_pack(
         options.out,
@@ -114,7 +123,9 @@ def _phase(config: dict[str, Any], updates: int, target_views: list[int]) -> dic
     data = {name: config["data"][name] for name in CLIPS} | {"target_views": target_views}
     sections = {name: config[name] for name in (*STAGES, "model", "loss", "optimizer", "seed")}
     trainer = {name: config["trainer"].get(name) for name in ("precision", "gradient_clip_val")}
-    return {**sections, "data": data, "trainer": trainer, "updates": updates}
+    averaging = (config.get("callbacks") or {}).get("weight_averaging")
+    averaging = averaging and {name: averaging[name] for name in ("decay", "warmup")}
+    return {**sections, "data": data, "trainer": trainer, "averaging": averaging, "updates": updates}
 
 
 def _train(options: argparse.Namespace) -> None:
@@ -128,17 +139,51 @@ def _train(options: argparse.Namespace) -> None:
     settings, trajectories = read_pack(options.pack)
     print(f"{len(trajectories)} trajectories unpacked", flush=True)
     progress = read_progress(options.resume) if options.resume else Progress()
-    training = Training(settings["phases"], trajectories, torch.device(options.device), options.workers, progress)
+    in_all = None if options.minutes_in_all is None else 60 * options.minutes_in_all
+    training = Training(
+        _changed(settings["phases"], options.seed, options.clips),
+        trajectories,
+        torch.device(options.device),
+        options.workers,
+        progress,
+        seconds_in_all=in_all,
+        precision=options.precision,
+    )
     before = (progress.seconds, len(progress.curve))
     training.run(deadline, options.out, 60 * options.save_minutes)
     seconds, points = progress.seconds - before[0], progress.curve[before[1] :]
     for point in points[:: max(1, len(points) // 20)]:
         print("  ".join(f"{name} {value:.5g}" for name, value in point.items()))
+    _print_paces(points)
     where = "done" if training.is_done else f"phase {progress.phase}, update {progress.step}"
     each = seconds / max(1, training.num_taken)
     print(f"{where}; {seconds:.1f} s of updates now ({each:.3f} s each), {progress.seconds:.1f} s in all")
     if training.device.type == "cuda":
         print(f"{torch.cuda.get_device_name()}: {torch.cuda.max_memory_allocated() / 2**30:.1f} GiB at most")
+
+
+def _print_paces(points: list[dict[str, float]]) -> None:
+    """Print seconds an update of each phase and rollout length, the first of each left out."""
+    found: dict[tuple[int, int], list[float]] = {}
+    for before, point in pairwise(points):
+        place = (int(point["phase"]), int(point["num_steps"]))
+        if place == (int(before["phase"]), int(before["num_steps"])):
+            found.setdefault(place, []).append(
+                (point["seconds"] - before["seconds"]) / (point["step"] - before["step"])
+            )
+    for (phase, num_steps), paces in found.items():
+        print(f"phase {phase}, {num_steps} predicted steps: {median(paces):.3f} s an update")
+
+
+def _changed(phases: list[dict[str, Any]], seed: int | None, clips: int | None) -> list[dict[str, Any]]:
+    """Return the phases with another seed (of weights and clips), the last one with other clips an update."""
+    changed = [{**phase, "data": dict(phase["data"])} for phase in phases]
+    if seed is not None:
+        for phase in changed:
+            phase["seed"] = phase["data"]["seed"] = seed
+    if clips is not None:
+        changed[-1]["data"]["batch_size"] = clips
+    return changed
 
 
 def _run(options: argparse.Namespace) -> None:
@@ -158,8 +203,9 @@ def _run(options: argparse.Namespace) -> None:
             "Train until the last phase."
         )
     path = options.folder / "checkpoints" / LAST
+    weights = {**progress.weights, **progress.average}
     content = {
-        "state_dict": {f"simulator.{name}": progress.weights[name] for name in last.state_dict()},
+        "state_dict": {f"simulator.{name}": weights[name] for name in last.state_dict()},
         "hyper_parameters": settings["config"],
         "global_step": progress.step,
         TRAINED_ON: settings["checksums"],

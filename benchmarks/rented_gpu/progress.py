@@ -24,7 +24,7 @@ _OCTAVES, _CODES_PER_OCTAVE = 31.75, 8  # codes 1 to 255 span them, below the la
 
 @dataclass
 class Progress:
-    """Where a training stands: ``phase`` and the updates taken in it, weights, Adam's memory, and the curve so far."""
+    """Where a training stands: the ``phase`` and how far in it, weights, their average, Adam's memory, the curve."""
 
     phase: int = 0
     step: int = 0
@@ -32,6 +32,8 @@ class Progress:
     weights: dict[str, Tensor] = field(default_factory=dict)
     second_moments: dict[str, Tensor] = field(default_factory=dict)
     curve: list[dict[str, float]] = field(default_factory=list)
+    phase_seconds: float = 0.0
+    average: dict[str, Tensor] = field(default_factory=dict)
 
 
 def write_progress(folder: Path, progress: Progress) -> list[Path]:
@@ -46,7 +48,9 @@ def write_progress(folder: Path, progress: Progress) -> list[Path]:
             "phase": progress.phase,
             "step": progress.step,
             "seconds": progress.seconds,
+            "phase_seconds": progress.phase_seconds,
             "weights": {name: _three_bytes(value) for name, value in progress.weights.items()},
+            "average": {name: _three_bytes(value) for name, value in progress.average.items()},
             "second_moments": {name: _one_byte(value) for name, value in progress.second_moments.items()},
             "curve": json.dumps(progress.curve),
         },
@@ -97,6 +101,8 @@ def read_progress(folder: Path) -> Progress:
         weights={name: _from_three_bytes(*value) for name, value in content["weights"].items()},
         second_moments={name: _from_one_byte(*value) for name, value in content["second_moments"].items()},
         curve=json.loads(content["curve"]),
+        phase_seconds=content["phase_seconds"],
+        average={name: _from_three_bytes(*value) for name, value in content["average"].items()},
     )
 
 

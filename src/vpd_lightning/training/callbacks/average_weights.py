@@ -7,6 +7,8 @@ import torch
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
+from vpd_lightning.training.averaging import share_kept
+
 CURRENT = "current_model_state"
 """Where a checkpoint keeps the weights that training goes on with; its ``state_dict`` is the average."""
 
@@ -37,7 +39,7 @@ class AverageWeights(WeightAveraging):
 
     def share_kept(self, num_averaged: int) -> float:
         """Return how much of the average of that many weights stays when the next ones are taken in."""
-        return min(self.decay, (1 + num_averaged) / (self.warmup + num_averaged))
+        return share_kept(num_averaged, self.decay, self.warmup)
 
     def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Follow the system to its device, on which it was not yet when its copy was made."""
