@@ -2,9 +2,10 @@
 
 Needs torch, triton and what the core imports: no Hydra, no Lightning. Each part runs in a process of its own with a
 budget of seconds, writes ``gpu_<part>_<device>.json``, and is skipped where that file is there already: start it again
-after an interruption. A part that fails leaves its traceback in ``gpu_<part>_<device>.failed.txt``; the exit code is 1
-then. ``--device cpu --rehearse`` runs everything at tiny sizes on a CPU, Triton's kernels in its interpreter. Where
-PyYAML is missing, ``--stages FILE`` takes what ``python -m benchmarks.stages FILE`` wrote elsewhere.
+after an interruption. A part that fails, or whose time is up, leaves its rows so far in
+``gpu_<part>_partial_<device>.json`` and its traceback in ``gpu_<part>_<device>.failed.txt``; the exit code is 1 then.
+``--device cpu --rehearse`` runs everything at tiny sizes on a CPU, Triton's kernels in its interpreter. Where PyYAML is
+missing, ``--stages FILE`` takes what ``python -m benchmarks.stages FILE`` wrote elsewhere.
 """
 
 import argparse
@@ -24,6 +25,9 @@ PARTS = {
     "memory": 60,
     "scaling": 100,
 }
+
+
+PARTIAL = "_partial"  # in the name of a result that is not complete
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -105,8 +109,11 @@ def _run_part(options: argparse.Namespace) -> int:
     device = torch.device(options.device)
     size = "tiny" if options.rehearse else "full"
     how = Options(device, size, 1 if options.rehearse else options.repeats)
-    result = getattr(gpu_parts, options.part)(how)
-    write(f"gpu_{options.part}", device, result, options.out)
+    for result in getattr(gpu_parts, options.part)(how):
+        write(f"gpu_{options.part}{PARTIAL}", device, result, options.out)
+    for suffix in (".csv", ".json"):
+        partial = options.out / f"gpu_{options.part}{PARTIAL}_{device.type}{suffix}"
+        partial.replace(options.out / f"gpu_{options.part}_{device.type}{suffix}")
     return 0
 
 
@@ -116,11 +123,13 @@ def _print_tables(options: argparse.Namespace) -> list[str]:
 
     failed = []
     for part in options.only or PARTS:
-        path = options.out / f"gpu_{part}_{options.device}.json"
-        if path.exists():
-            content = read(path)
+        names = (f"gpu_{part}_{options.device}.json", f"gpu_{part}{PARTIAL}_{options.device}.json")
+        paths = [options.out / name for name in names if (options.out / name).exists()]
+        if paths:
+            content = read(paths[0])
             failed += [f"{part}: {name}" for name in content["facts"] if name.endswith(" failed")]
-            print(f"\n{part}: {content['device']}\n{table(content['rows'])}")
+            part_of = ", as far as it got" if PARTIAL in paths[0].name else ""
+            print(f"\n{part}{part_of}: {content['device']}\n{table(content['rows'])}")
             for name, value in content["facts"].items():
                 print(f"{name}: {shown(value)}")
     return failed

@@ -1,7 +1,10 @@
-"""The parts of ``benchmarks.gpu``: each measures on one device and returns its rows."""
+"""The parts of ``benchmarks.gpu``: each measures on one device and yields what it has after every row.
+
+So a part whose time is up leaves the rows that it got to.
+"""
 
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
@@ -25,12 +28,12 @@ KEYS = RandomKeys.fixed(1)
 RADII, BANDWIDTHS = (0.0, 0.05, 0.1, 0.5), (0.05, 0.05, 0.05, 0.5)
 
 
-def knn(options: Options) -> Result:
+def knn(options: Options) -> Iterator[Result]:
     """Search of the renderer's neighbours by the Triton kernel, its twin and what else is there, against float64."""
-    return neighbors_suite.run(options)
+    yield neighbors_suite.run(options)
 
 
-def features(options: Options) -> Result:
+def features(options: Options) -> Iterator[Result]:
     """Sums under annular kernels, forward and backward, by the Triton kernel and by its twin, against float64."""
     device = options.device
     count, rays, samples = options.pick((16384, 512, 384), (4096, 128, 192), (33, 3, 7))
@@ -69,10 +72,10 @@ def features(options: Options) -> Result:
             baseline = "" if name == "torch" else "torch"
             there = () if name == "torch" else seconds["torch"]
             rows.append(row(f"{kind}/{name}", seconds[name], baseline, there, error, None, peak, note))
-    return Result(rows)
+            yield Result(rows)
 
 
-def train_step(options: Options) -> Result:
+def train_step(options: Options) -> Iterator[Result]:
     """One step at the paper's scale: the plain path in float32, ours in float32, bf16, compiled, with surface."""
     scale = options.pick(PAPER, PAPER, TINY)
     variants = ("plain", "fast", "saving", "bf16", "compiled", "surface", "surface_bf16")
@@ -81,6 +84,7 @@ def train_step(options: Options) -> Result:
     plain_seconds: list[float] = []
     reference = None
     for variant in variants:  # one after the other: two of them need not fit beside each other
+        print(f"train_step/{variant} begins", flush=True)
         try:
             step = Step(variant, scale, options.device)
             step()
@@ -92,6 +96,7 @@ def train_step(options: Options) -> Result:
                 raise
             rows.append(row(f"train_step/{variant}", note=f"failed: {type(error).__name__}: {str(error)[:200]}"))
             facts[f"{variant} failed"] = traceback.format_exc()
+            yield Result(rows, facts)
             continue
         if variant == "plain":
             reference, plain_seconds = gradients, seconds
@@ -102,12 +107,13 @@ def train_step(options: Options) -> Result:
         baseline = "" if variant == "plain" else "plain"
         there = () if variant == "plain" else plain_seconds
         rows.append(row(f"train_step/{variant}", seconds, baseline, there, error, None, peak, note))
+        yield Result(rows, facts)
         if variant == "fast":
             facts |= _floor(step, options)
         del step, gradients
         if options.device.type == "cuda":
             torch.cuda.empty_cache()
-    return Result(rows, facts)
+    yield Result(rows, facts)
 
 
 def _floor(step: Step, options: Options) -> dict[str, Any]:
@@ -137,7 +143,7 @@ def _floor(step: Step, options: Options) -> dict[str, Any]:
 _KINDS = {"float32": torch.float32, "bf16": torch.bfloat16}
 
 
-def dynamics(options: Options) -> Result:
+def dynamics(options: Options) -> Iterator[Result]:
     """Steps of the graph network at inference: as it is, in bf16, and with fixed shapes and torch.compile."""
     rows: list[Row] = []
     facts: dict[str, Any] = {}
@@ -166,11 +172,12 @@ def dynamics(options: Options) -> Result:
                     raise
                 rows.append(row(f"{count}/{name}", note=f"failed: {type(error).__name__}: {str(error)[:200]}"))
                 facts[f"{count} {name} failed"] = traceback.format_exc()
+                yield Result(rows, facts)
                 continue
             if name == "eager":
                 eager = seconds
             rows.append(row(f"{count}/{name}", seconds, "" if name == "eager" else "eager", eager, peak_bytes=peak))
-    return Result(rows, facts)
+            yield Result(rows, facts)
 
 
 def _step_call(
@@ -184,7 +191,7 @@ def _step_call(
     return call
 
 
-def frames(options: Options) -> Result:
+def frames(options: Options) -> Iterator[Result]:
     """A 128x128 frame of 16,384 particles by surface and by the volume renderer, in float32 and bf16."""
     device = options.device
     count, size = options.pick((16384, 128), (4096, 64), (64, 4))
@@ -208,10 +215,10 @@ def frames(options: Options) -> Result:
             note = f"{size}x{size}, {count} particles, untrained; RMS difference of colour to float32"
             peak = device_peak(call, device)
             rows.append(row(f"{kind}/{name}", seconds, "point_nerf, float32", baseline, error, None, peak, note))
-    return Result(rows)
+            yield Result(rows)
 
 
-def memory(options: Options) -> Result:
+def memory(options: Options) -> Iterator[Result]:
     """A training step and a rollout with 2^17 particles: allocated memory."""
     if options.size == "tiny":
         scale, count = replace(TINY, particles=128), 128
@@ -222,15 +229,16 @@ def memory(options: Options) -> Result:
     seconds = interleaved({"step": step}, 1, options.device)["step"]
     peak = device_peak(step, options.device)
     rows = [row(f"training step/{count}", seconds, peak_bytes=peak, note="activations computed again; one clip")]
+    yield Result(rows)
     del step
     if options.size != "tiny":
         call = scaling_suite.roll_out_and_render(count, 3, 128, options.device.type)
         peak = device_peak(call, options.device)
         seconds = interleaved({"rollout": call}, 1, options.device)["rollout"]
         rows.append(row(f"3 steps and a frame/{count}", seconds, peak_bytes=peak, note=f"all finite: {call()}"))
-    return Result(rows)
+        yield Result(rows)
 
 
-def scaling(options: Options) -> Result:
+def scaling(options: Options) -> Iterator[Result]:
     """The scaling suite on this device."""
-    return scaling_suite.run(replace(options, repeats=max(1, options.repeats // 2)))
+    yield scaling_suite.run(replace(options, repeats=max(1, options.repeats // 2)))

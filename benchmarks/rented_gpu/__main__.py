@@ -46,6 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     train.add_argument("--clips", type=int, help="of an update of the last training")
     train.add_argument("--precision", choices=["bf16", "tf32", "float32"], help="another one than the pack's")
     train.add_argument("--save-minutes", type=float, default=2.0)
+    train.add_argument("--profile", type=int, help="after so many updates, print what three more spend their time on")
     train.add_argument("--device", default="cuda")
     train.add_argument("--workers", type=int, default=8, help="processes that draw clips")
     train.set_defaults(call=_train)
@@ -149,6 +150,9 @@ def _train(options: argparse.Namespace) -> None:
         seconds_in_all=in_all,
         precision=options.precision,
     )
+    if options.profile is not None:
+        print(training.profiled(options.profile))
+        return
     before = (progress.seconds, len(progress.curve))
     training.run(deadline, options.out, 60 * options.save_minutes)
     seconds, points = progress.seconds - before[0], progress.curve[before[1] :]

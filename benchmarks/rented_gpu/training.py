@@ -129,6 +129,22 @@ class Training:
             return float(self.progress.step / config["updates"])
         return float(min(1.0, self.progress.phase_seconds / (config["share"] * self.seconds_in_all)))
 
+    def profiled(self, warm_up: int, updates: int = 3) -> str:
+        """Take ``warm_up`` updates, and return a table of the operations of the next ones, the longest first."""
+        batches = iter(self._batches())
+        for _ in range(warm_up):
+            self._update(next(batches))
+        with torch.profiler.profile() as record:
+            for _ in range(updates):
+                self._update(next(batches))
+        on_device = self.device.type == "cuda"
+        totals = record.key_averages()
+        calls = sum(item.count for item in totals if item.key in ("cudaLaunchKernel", "cuLaunchKernelEx"))
+        waits = sum(item.count for item in totals if "Synchronize" in item.key or item.key == "aten::item")
+        order = "self_cuda_time_total" if on_device else "self_cpu_time_total"
+        rows = totals.table(sort_by=order, row_limit=25, max_name_column_width=60)
+        return f"{rows}\n{calls / updates:.0f} kernels and {waits / updates:.0f} waits an update"
+
     def save(self, out: Path) -> None:
         """Write the state."""
         names = {weight: name for name, weight in self.system.named_parameters()}

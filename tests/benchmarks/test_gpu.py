@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import gpu, stages
+from benchmarks import gpu, gpu_parts, stages
 from benchmarks.measuring import Result, row
 from benchmarks.results_files import read, write
 
@@ -62,6 +62,23 @@ def test_part_that_fails_leaves_its_traceback_and_fails_the_run(tmp_path: Path):
     assert code == 1
     assert "no_such_file.json" in (tmp_path / "gpu_frames_cpu.failed.txt").read_text()
     assert not (tmp_path / "gpu_frames_cpu.json").exists()
+
+
+def test_part_that_ends_early_leaves_its_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    def interrupted(options):
+        yield Result([row("frames/first", [0.5])])
+        raise RuntimeError("no more memory")
+
+    monkeypatch.setattr(gpu_parts, "frames", interrupted)
+
+    with pytest.raises(RuntimeError, match="no more memory"):
+        gpu.main([*REHEARSE, "--part", "frames", "--out", str(tmp_path)])
+
+    assert read(tmp_path / "gpu_frames_partial_cpu.json")["rows"][0].seconds == 0.5
+    assert not (tmp_path / "gpu_frames_cpu.json").exists()
+    monkeypatch.setattr(gpu, "_in_own_process", lambda *_: "not done")
+    assert gpu.main([*REHEARSE, "--only", "frames", "--out", str(tmp_path)]) == 1
+    assert "frames, as far as it got" in capsys.readouterr().out
 
 
 def test_variant_that_failed_inside_a_part_fails_the_run(tmp_path: Path, capsys: pytest.CaptureFixture):

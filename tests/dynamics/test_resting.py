@@ -7,6 +7,7 @@ import torch
 
 from tests.dynamics.solids import even_cube
 from tests.dynamics.test_inertial import dynamics
+from vpd_lightning.actions import expanded
 from vpd_lightning.dynamics.inertial import driven_bodies
 from vpd_lightning.dynamics.inertial.resting import rows_of, with_rows
 from vpd_lightning.randomness import RandomKeys
@@ -136,6 +137,49 @@ def test_hidden_sides_are_drawn_of_those_that_move_and_of_those_that_rest() -> N
     went = (last.hidden_side.positions - first.hidden_side.positions).norm(dim=-1)
     assert bool(last.hidden_side.mask.any(dim=1).all()), "each cube has a hidden side"
     assert went[0].max() < 1e-3 and went[1][last.hidden_side.mask[1]].min() > 0.03
+
+
+def joined(*motions: Driven) -> Driven:
+    names = ("positions", "normals", "groups", "mask", "next_positions", "next_normals")
+    return Driven(**{name: torch.cat([getattr(one, name) for one in motions]) for name in names})
+
+
+def test_candidates_from_one_moment_are_advanced_once_until_one_touches_a_body(monkeypatch) -> None:
+    made = heavy(skip_resting=True, supported_speed=0.0)  # the cube tips: it moves in all candidates
+    motions = [plate(-0.6, 0.0), plate(-0.11, 0.02), plate(-0.7, 0.0), plate(-0.2, 0.05)]
+    sizes, step = [], made._step
+
+    def counted(current, memory):
+        sizes.append(len(current.mask))
+        return step(current, memory)
+
+    alone = [rolled(made, motion, 5)[-1] for motion in motions]
+    monkeypatch.setattr(made, "_step", counted)
+    driven, scene, keys = joined(*motions), cube_on_a_table(), RandomKeys.fixed(4)
+    with torch.no_grad():
+        first = replace(scene, driven=motions[0])
+        memory = expanded(made.initialize(first, first, RandomKeys.fixed(1)), 4)
+        previous = current = replace(expanded(scene, 4), driven=driven)
+        for number in range(5):
+            following, memory = made(previous, current, memory, keys, number)
+            shift = driven.next_positions - driven.positions
+            now = replace(current.driven, positions=current.driven.next_positions)
+            following = replace(following, driven=replace(now, next_positions=now.positions + shift))
+            previous, current = current, following
+
+    assert sizes[:2] == [2, 3], "one for all that touch nothing, one for each of the others"
+    assert sizes[-1] == 2, "where it is not pushed, the cube has come to rest"
+    for number, one in enumerate(alone):
+        assert torch.allclose(current.positions[number], one.positions[0], rtol=0, atol=1e-12)
+        assert torch.allclose(current.features[number], one.features[0], rtol=0, atol=1e-12)
+        assert torch.equal(current.driven.positions[number], motions[number].positions[0] + 5 * shift[number])
+    assert not torch.equal(current.positions[0], current.positions[1])
+
+    changed = current.positions.clone()
+    changed[2] += 0.01  # by hand: no longer what its past says
+    with torch.no_grad():
+        following, _ = made(previous, replace(current, positions=changed), memory, keys, 5)
+    assert not torch.equal(following.positions[2], following.positions[0])
 
 
 def test_with_gradients_nothing_is_skipped() -> None:

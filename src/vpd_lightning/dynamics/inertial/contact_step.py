@@ -1,9 +1,9 @@
 """What contact makes of a step: bodies, what stands still, and what is driven, in one solver."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia
@@ -14,12 +14,14 @@ from vpd_lightning.dynamics.inertial.driven_bodies import (
     DrivenBodies,
     driven_bodies,
     is_pushed,
+    is_touched,
     joined_inertia,
     joined_materials,
     joined_motion,
     meet,
 )
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
+from vpd_lightning.dynamics.inertial.resting import rows_of
 from vpd_lightning.dynamics.inertial.substeps import SubstepSolver
 from vpd_lightning.types import Driven
 
@@ -32,13 +34,35 @@ def about_to_be_pushed(
     return is_pushed(driven_bodies(driven, memory.origin), surface, memory.motion)
 
 
+@dataclass(frozen=True)
+class BeforeContact:
+    """A step as forces alone would make it, and what may touch something in it."""
+
+    motion: BodyMotion
+    inertia: Inertia
+    points: ContactPoints
+    contacts: Contacts  # with what stands still
+
+
+def touched_by_driven(
+    driven: Driven,
+    step: BeforeContact,
+    positions: Float[Tensor, "state moving 3"],
+    memory: InertialMemory,
+    place: Int64[Tensor, " batch"],
+    *,
+    is_mirrored: bool,
+) -> Bool[Tensor, " batch"]:
+    """Return which of several driven motions touch a body; ``place`` says from which of the states each starts."""
+    surface = pushed_surface(positions, memory, is_mirrored)
+    parts = rows_of((surface, step.motion, step.points, memory.origin), place, len(positions))
+    return is_touched(driven_bodies(driven, parts[3]), *parts[:3])
+
+
 def resolved_contacts(
-    motion: BodyMotion,
-    inertia: Inertia,
+    step: BeforeContact,
     memory: InertialMemory,
     positions: Float[Tensor, "batch moving 3"],
-    points: ContactPoints,
-    contacts: Contacts,
     driven: DrivenBodies | None,
     driven_friction: Float[Tensor, ""] | None,
     *,
@@ -48,11 +72,12 @@ def resolved_contacts(
     num_substeps: int | None,
     max_depth: float,
 ) -> Resolved:
-    """Return the step after contact of ``points`` with what stands still (``contacts``), each other and what is driven.
+    """Return the step after contact of bodies with what stands still, each other and what is driven.
 
-    ``motion`` is the step that bodies would take without; what is driven is left out of the result. With
-    ``num_substeps`` it is resolved in so many parts (``SubstepSolver``), else at once in ``num_iterations``.
+    What is driven is left out of the result. With ``num_substeps`` it is resolved in so many parts
+    (``SubstepSolver``), else at once in ``num_iterations``.
     """
+    motion, inertia, points, contacts = step.motion, step.inertia, step.points, step.contacts
     before = memory.motion
     between, materials, masses = between_bodies(points, memory), memory.materials, memory.masses
     num_bodies, met = masses.shape[1], None
@@ -91,5 +116,5 @@ def resolved_contacts(
     if driven_friction is None:
         return resolved
     # Nothing was touched: a gradient of zero all the same, because on several devices each weight must have one.
-    step = replace(resolved.step, displacements=resolved.step.displacements + 0 * driven_friction)
-    return replace(resolved, step=step)
+    displacements = resolved.step.displacements + 0 * driven_friction
+    return replace(resolved, step=replace(resolved.step, displacements=displacements))

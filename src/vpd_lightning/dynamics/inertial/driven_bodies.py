@@ -108,8 +108,7 @@ def meet(
     step; long steps are looked at in parts.
     """
     own = points.bodies
-    target, is_met = _met_by_driven(bodies, surface, motion)
-    nearest, touches = _met_by_bodies(bodies, points, motion, torch.gather(surface.sizes, 1, own) / 3)
+    target, is_met, nearest, touches = _met(bodies, surface, motion, points)
     if not bool(is_met.any() | touches.any()):
         return None
     count, num_driven = points.positions.shape[1], bodies.positions.shape[1]
@@ -137,6 +136,14 @@ def meet(
         static=Contacts(*(_padded(values, members.shape[-1]) for values in static.parts())),
         between=BodyContacts(torch.cat(others, dim=1), torch.cat(known, dim=1)),
     )
+
+
+def is_touched(
+    bodies: DrivenBodies, surface: Surface, motion: BodyMotion, points: ContactPoints
+) -> Bool[Tensor, " batch"]:
+    """Return in which members ``meet`` finds something."""
+    _, is_met, _, touches = _met(bodies, surface, motion, points)
+    return is_met.any(dim=1) | touches.any(dim=1)
 
 
 def is_pushed(bodies: DrivenBodies, surface: Surface, motion: BodyMotion) -> Bool[Tensor, " batch"]:
@@ -174,6 +181,14 @@ def joined_materials(materials: Materials, friction: Float[Tensor, ""], count: i
         stiffness=joined(materials.stiffness, 0.0),
         damping=joined(materials.damping, 0.0),
     )
+
+
+def _met(
+    bodies: DrivenBodies, surface: Surface, motion: BodyMotion, points: ContactPoints
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return targets of driven points and whether they meet them, and the same of the points of bodies."""
+    depth = torch.gather(surface.sizes, 1, points.bodies) / 3
+    return *_met_by_driven(bodies, surface, motion), *_met_by_bodies(bodies, points, motion, depth)
 
 
 @torch.no_grad()

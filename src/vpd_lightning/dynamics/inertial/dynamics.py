@@ -13,7 +13,7 @@ from vpd_lightning.dynamics.inertial.body_forces import BodyForces
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia, body_volumes, matrices_of, vectors_of
 from vpd_lightning.dynamics.inertial.contact import Resolved
 from vpd_lightning.dynamics.inertial.contact_points import contact_points
-from vpd_lightning.dynamics.inertial.contact_step import about_to_be_pushed, resolved_contacts
+from vpd_lightning.dynamics.inertial.contact_step import BeforeContact, resolved_contacts, touched_by_driven
 from vpd_lightning.dynamics.inertial.driven_bodies import DrivenBodies, driven_bodies
 from vpd_lightning.dynamics.inertial.first_motion import (
     arriving_motion,
@@ -28,15 +28,16 @@ from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity
 from vpd_lightning.dynamics.inertial.hidden_side import HiddenGuess, hidden_after
 from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, elastic
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
-from vpd_lightning.dynamics.inertial.resting import held, is_slow, members_in_use, rested, rows_of, with_rows
+from vpd_lightning.dynamics.inertial.resting import held, is_slow, members_in_use, rested
 from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, rotate, rotation_from_spin
 from vpd_lightning.dynamics.inertial.round_bodies import fit_ellipsoids, on_feet, with_feet
 from vpd_lightning.dynamics.inertial.shading import MovingShading, StaticShading
+from vpd_lightning.dynamics.inertial.skipping import step_where_it_moves
 from vpd_lightning.dynamics.inertial.standing import may_be_hidden, standing
 from vpd_lightning.dynamics.inertial.static_surface import static_contacts, static_surface, trusted_normals
 from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles
+from vpd_lightning.types import Driven, Particles
 
 _ARM = 0.2
 """Of the contact range, about a body's size: a rotation counts by how far it moves a point there."""
@@ -76,7 +77,8 @@ class InertialDynamics(AbstractDynamics):
     With ``round_contact`` bodies that are ellipsoids, as far as was seen, roll as such (``round_bodies``).
 
     With ``skip_resting``, and without gradients, a member of the batch in which all bodies rest (in contact, slower
-    than ``rest_share``) and nothing driven is about to push one stays as it is.
+    than ``rest_share``) and nothing driven is about to push one stays as it is. Members that were one (candidate
+    motions from one moment) are advanced once until something driven touches a body (``skipping``).
 
     For comparisons, each part can be left out: with ``first_velocity`` null bodies start at rest; with ``keep_shape``
     false every particle goes on with its own velocity, to which it adds what its body's changes by; with
@@ -241,6 +243,7 @@ class InertialDynamics(AbstractDynamics):
             surface=static_surface((seen.positions, seen.normals, mask), seen.positions, mask, None, empty),
             shapes=shapes,
             at_rest=~members_in_use(bodies),
+            past=torch.arange(len(mask), device=mask.device),
         )
         return standing(
             memory,
@@ -280,24 +283,16 @@ class InertialDynamics(AbstractDynamics):
                 memory = self._first_memory(*observed(previous, current))
             if not self.skip_resting or torch.is_grad_enabled():
                 return self._step(current, memory)
-            return self._step_where_it_moves(current, memory)
-
-    def _step_where_it_moves(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
-        """Advance the members of the batch in which something moves or is about to be pushed."""
-        count, is_idle = len(current.mask), memory.at_rest.all(dim=1)
-        driven = current.driven if self.has_driven else None
-        if driven is not None and bool(is_idle.any()):
-            positions = take(current.positions, memory.index) - memory.origin
-            idle = is_idle.nonzero()[:, 0]
-            parts = rows_of((driven, positions, memory), idle, count)
-            is_idle = is_idle.index_put((idle,), ~about_to_be_pushed(*parts, is_mirrored=self.mirror_hidden))
-        if not bool(is_idle.any()) or self.hidden_guess is not None and current.hidden_side is None:
-            return self._step(current, memory)  # also where there are no hidden sides yet to keep
-        rows = (~is_idle).nonzero()[:, 0]
-        if len(rows) == 0:
-            return current, memory
-        some = rows_of((current, memory), rows, count)
-        return with_rows((current, memory), rows, some, self._step(*some), count)
+            return step_where_it_moves(
+                self._step,
+                self._touches,
+                current,
+                memory,
+                take(current.positions, memory.index) - memory.origin,
+                current.driven if self.has_driven else None,
+                is_mirrored=self.mirror_hidden,
+                has_all_sides=self.hidden_guess is None or current.hidden_side is not None,
+            )
 
     def _step(self, current: Particles, memory: InertialMemory) -> tuple[Particles, InertialMemory]:
         positions = take(current.positions, memory.index) - memory.origin
@@ -336,14 +331,14 @@ class InertialDynamics(AbstractDynamics):
         normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
         return replace(current, positions=all_positions, features=features, normals=normals, hidden_side=side), memory
 
-    def _resolved(
-        self,
-        positions: Tensor,
-        static_positions: Tensor,
-        memory: InertialMemory,
-        driven: DrivenBodies | None,
-    ) -> Resolved:
-        """Return the step after forces, elastic return and contact."""
+    def _touches(self, current: Particles, memory: InertialMemory, driven: Driven, place: Tensor) -> Tensor:
+        """Return which of the driven motions touch a body in the state that ``place`` says."""
+        positions = take(current.positions, memory.index) - memory.origin
+        step = self._before_contact(positions, take(current.positions, memory.static_index) - memory.origin, memory)
+        return touched_by_driven(driven, step, positions, memory, place, is_mirrored=self.mirror_hidden)
+
+    def _before_contact(self, positions: Tensor, static_positions: Tensor, memory: InertialMemory) -> BeforeContact:
+        """Return the step after forces and elastic return."""
         probes = slice(0, self.num_probes)
         probe_positions, members = positions[:, probes], memory.bodies[:, :, probes]
         materials = memory.materials
@@ -370,13 +365,16 @@ class InertialDynamics(AbstractDynamics):
             inertia,
         )
         motion = held(replace(motion, strains=elastic(motion, materials)), memory.undisturbed)
+        return BeforeContact(motion, inertia, points, on_feet(contacts, points, far))
+
+    def _resolved(
+        self, positions: Tensor, static_positions: Tensor, memory: InertialMemory, driven: DrivenBodies | None
+    ) -> Resolved:
+        """Return the step after forces, elastic return and contact."""
         return resolved_contacts(
-            motion,
-            inertia,
+            self._before_contact(positions, static_positions, memory),
             memory,
             positions,
-            points,
-            on_feet(contacts, points, far),
             driven,
             None if self.log_driven_friction is None else self.log_driven_friction.exp(),
             is_mirrored=self.mirror_hidden,

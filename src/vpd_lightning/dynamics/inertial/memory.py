@@ -39,3 +39,4 @@ class InertialMemory:
     undisturbed: Bool[Tensor, "batch body"]  # it was seen to stand still, and nothing has pushed it since
     shapes: Float[Tensor, "batch body 3 3"]  # of ellipsoids (square metres, ``round_bodies``), 0 of other bodies
     at_rest: Bool[Tensor, "batch body"]  # it stands or lies and hardly moves; a place without a body does, too
+    past: Int[Tensor, " batch"]  # equal numbers: members that were one, and have met nothing driven since
