@@ -82,6 +82,7 @@ def motion(velocity: tuple[float, float, float]) -> BodyMotion:
     [
         (0.02, (0, 0, 0), 0.02),  # its foot was not seen
         (-0.01, (0, 0, 0), -0.01),  # its guessed foot lies in the table
+        (-0.03, (0, 0, 0), 0.0),  # so deep that the guess is wrong, as with two bodies taken for one
         (0.02, (0.03, 0, 0), 0.02),  # it slides
         (0.02, (0, 0, -0.02), 0.0),  # it falls
         (0.2, (0, 0, 0), 0.0),  # it hangs in the air, at the top of its flight

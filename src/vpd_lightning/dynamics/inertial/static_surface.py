@@ -21,8 +21,9 @@ _AT_WALL = 2.0
 _NUM_NEIGHBOURS, _NUM_AGREEING, _AGREEMENT = 8, 4, 0.9
 """A normal is trusted that so many of the nearest particles share, to this cosine."""
 
-_MOST_CLEARANCE = 0.75
-"""Of a body's size: what seems to end farther above its surface, or below it, does not rest on that one."""
+_MOST_CLEARANCE, _MOST_SUNK = 0.75, 0.45
+"""Of a body's size: what seems to end farther above its surface does not rest on it; farther below it, its guessed
+hidden side is wrong (that of two bodies taken for one), and with it they would sink through."""
 
 
 @dataclass(frozen=True)
@@ -191,5 +192,5 @@ def resting_clearances(
     gaps, lowest = found.distances[:, None].masked_fill(~belongs, torch.inf).min(dim=-1)
     normals = vectors_of(found.normals, lowest)
     approach = (motion.displacements * normals).sum(dim=-1).abs()
-    is_supported = (approach < max_speed) & (gaps.abs() < _MOST_CLEARANCE * sizes)
+    is_supported = (approach < max_speed) & (gaps < _MOST_CLEARANCE * sizes) & (gaps > -_MOST_SUNK * sizes)
     return torch.where(is_supported, gaps, 0.0), is_supported
