@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
     train.add_argument("--resume", type=Path, help="folder with the state to go on from")
     train.add_argument("--minutes", type=float, default=9.0, help="until it stops")
     train.add_argument("--minutes-in-all", type=float, help="of all phases, earlier calls counted in; not --updates")
-    train.add_argument("--seed", type=int, help="another one than the pack's")
+    train.add_argument("--seed", type=int, help="another one than the pack's; kept on resume")
     train.add_argument("--clips", type=int, help="of an update of the last training")
     train.add_argument("--precision", choices=["bf16", "tf32", "float32"], help="another one than the pack's")
     train.add_argument("--save-minutes", type=float, default=2.0)
@@ -139,10 +139,10 @@ def _train(options: argparse.Namespace) -> None:
     deadline = time.perf_counter() + 60 * options.minutes
     settings, trajectories = read_pack(options.pack)
     print(f"{len(trajectories)} trajectories unpacked", flush=True)
-    progress = read_progress(options.resume) if options.resume else Progress()
+    progress = read_progress(options.resume) if options.resume else Progress(seed=options.seed)
     in_all = None if options.minutes_in_all is None else 60 * options.minutes_in_all
     training = Training(
-        _changed(settings["phases"], options.seed, options.clips),
+        _changed(settings["phases"], progress.seed, options.clips),
         trajectories,
         torch.device(options.device),
         options.workers,
@@ -208,9 +208,12 @@ def _run(options: argparse.Namespace) -> None:
         )
     path = options.folder / "checkpoints" / LAST
     weights = {**progress.weights, **progress.average}
+    config = settings["config"]
+    if progress.seed is not None:
+        config = {**config, "seed": progress.seed, "data": {**config["data"], "seed": progress.seed}}
     content = {
         "state_dict": {f"simulator.{name}": weights[name] for name in last.state_dict()},
-        "hyper_parameters": settings["config"],
+        "hyper_parameters": config,
         "global_step": progress.step,
         TRAINED_ON: settings["checksums"],
     }

@@ -34,6 +34,7 @@ class Progress:
     curve: list[dict[str, float]] = field(default_factory=list)
     phase_seconds: float = 0.0
     average: dict[str, Tensor] = field(default_factory=dict)
+    seed: int | None = None  # where it is not the pack's
 
 
 def write_progress(folder: Path, progress: Progress) -> list[Path]:
@@ -49,6 +50,7 @@ def write_progress(folder: Path, progress: Progress) -> list[Path]:
             "step": progress.step,
             "seconds": progress.seconds,
             "phase_seconds": progress.phase_seconds,
+            "seed": progress.seed,
             "weights": {name: _three_bytes(value) for name, value in progress.weights.items()},
             "average": {name: _three_bytes(value) for name, value in progress.average.items()},
             "second_moments": {name: _one_byte(value) for name, value in progress.second_moments.items()},
@@ -102,6 +104,7 @@ def read_progress(folder: Path) -> Progress:
         second_moments={name: _from_one_byte(*value) for name, value in content["second_moments"].items()},
         curve=json.loads(content["curve"]),
         phase_seconds=content["phase_seconds"],
+        seed=content["seed"],
         average={name: _from_three_bytes(*value) for name, value in content["average"].items()},
     )
 

@@ -108,6 +108,44 @@ def test_training_stops_goes_on_and_comes_home(pack: Path, tmp_path: Path, capsy
         torch.testing.assert_close(value, done.weights[name], rtol=0, atol=0)
 
 
+def test_time_ends_phases_and_weights_are_averaged(pack: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    settings, trajectories = read_pack(pack)
+    phases = [{**phase, "averaging": {"decay": 0.9, "warmup": 2}} for phase in settings["phases"]]
+    phases[1]["data"] = {**phases[1]["data"], "num_steps_schedule": {"0.0": 1, "0.5": 2}}
+    assert sum(phase["share"] for phase in phases) == pytest.approx(1)
+    progress = Progress(seed=3)
+    training = Training(phases, trajectories, torch.device("cpu"), 0, progress, seconds_in_all=1000.0)
+    monkeypatch.setattr(training, "_count", lambda _, count=training._count: count(60.0))  # an update takes a minute
+
+    training.run(float("inf"), tmp_path, 1e9)
+
+    assert training.is_done
+    lengths = [training._lengths.at(share, 0, 0) for share in (0.1, 0.6)]
+    assert lengths == [1, 2]
+    taken = [sum(1 for _ in range(0, int(1000 * phase["share"]) + 60, 60)) for phase in phases]
+    assert training.num_taken == pytest.approx(sum(taken), abs=2)
+    assert read_progress(tmp_path).seed == 3
+
+
+def test_state_between_phases_holds_the_average_beside_the_weights(pack: Path, tmp_path: Path):
+    settings, trajectories = read_pack(pack)
+    phase = settings["phases"][0] | {"averaging": {"decay": 0.999, "warmup": 10}, "updates": 30}
+    training = Training([phase], trajectories, torch.device("cpu"), 0, Progress())
+    first = {name: value.clone() for name, value in training.system.state_dict().items()}
+    for batch, _ in zip(training._batches(), range(20), strict=False):
+        training._update(batch)
+    training.save(tmp_path)
+    kept = read_progress(tmp_path)
+
+    name = max(kept.average, key=lambda one: kept.average[one].numel())
+    assert not torch.equal(kept.average[name], first[name])
+    assert not torch.equal(kept.average[name], kept.weights[name])
+    again = Training([phase], trajectories, torch.device("cpu"), 0, kept)
+    torch.testing.assert_close(again._average[name], kept.average[name])
+    again._next_phase()
+    torch.testing.assert_close(again.progress.weights[name], kept.average[name])
+
+
 def test_training_goes_on_nearly_as_if_it_had_not_stopped(pack: Path, tmp_path: Path):
     settings, trajectories = read_pack(pack)
     phase = settings["phases"][0] | {"updates": 40}
@@ -162,6 +200,21 @@ def test_state_in_several_files_must_be_whole(tmp_path: Path):
         read_progress(tmp_path)
     with pytest.raises(CheckpointError, match="holds no state"):
         read_progress(tmp_path / "nowhere")
+
+
+def test_another_seed_is_that_of_the_run(pack: Path, tmp_path: Path):
+    state, run = tmp_path / "state", tmp_path / "run"
+    assert train(pack, state, "--seed", "5", "--clips", "1") == 0
+    assert rented_gpu.main(["run", "--pack", str(pack), "--state", str(state), "--folder", str(run)]) == 0
+    content = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    config = content["hyper_parameters"]
+    assert (config["seed"], config["data"]["seed"]) == (5, 5)
+
+
+def test_an_update_can_be_profiled(pack: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    assert train(pack, tmp_path / "state", "--profile", "1", "--minutes-in-all", "9") == 0
+    printed = capsys.readouterr().out
+    assert "aten::addmm" in printed and "waits an update" in printed
 
 
 def test_what_the_loop_does_not_offer_is_refused(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
