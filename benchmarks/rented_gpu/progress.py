@@ -103,9 +103,10 @@ def read_progress(folder: Path) -> Progress:
         weights={name: _from_three_bytes(*value) for name, value in content["weights"].items()},
         second_moments={name: _from_one_byte(*value) for name, value in content["second_moments"].items()},
         curve=json.loads(content["curve"]),
-        phase_seconds=content["phase_seconds"],
-        seed=content["seed"],
-        average={name: _from_three_bytes(*value) for name, value in content["average"].items()},
+        # Not in states of earlier versions.
+        phase_seconds=content.get("phase_seconds", 0.0),
+        seed=content.get("seed"),
+        average={name: _from_three_bytes(*value) for name, value in content.get("average", {}).items()},
     )
 
 

@@ -16,7 +16,6 @@ from benchmarks.rented_gpu.packing import PackedTrajectory
 from benchmarks.rented_gpu.progress import Progress, adam_second_moments, restore_adam, write_progress
 from vpd_lightning.data.collate import collate_clips
 from vpd_lightning.data.dataset import ClipDataset
-from vpd_lightning.data.rollout_lengths import RolloutLengths
 from vpd_lightning.data.sampler import StepBatchSampler
 from vpd_lightning.errors import NonFiniteError
 from vpd_lightning.randomness import derive_seed
@@ -117,10 +116,9 @@ class Training:
         progress.seconds += seconds
         progress.phase_seconds += seconds
         self._share.value = self._share_done()
-        lengths = self._lengths.at(self._share.value, 0, progress.step)
         if progress.step % 10 == 0 or progress.step == 1:
             where = {"phase": progress.phase, "step": progress.step, "seconds": round(progress.seconds, 2)}
-            progress.curve.append(where | {"num_steps": lengths} | self._last)
+            progress.curve.append(where | self._last)
 
     def _share_done(self) -> float:
         """Return how much of the phase is done: of its time where that is limited, else of its updates."""
@@ -181,8 +179,6 @@ class Training:
             for name, weight in trained.items()
         }
         self._averaged = list(trained.values())
-        data = config["data"]
-        self._lengths = RolloutLengths(data["num_steps"], _schedule(data["num_steps_schedule"]))
         self._last: dict[str, float] = {}
         self._share.value = self._share_done()
 
@@ -250,7 +246,12 @@ class Training:
         if self._average:
             kept = share_kept(progress.step, **self._averaging)
             torch._foreach_lerp_(list(self._average.values()), [w.detach() for w in self._averaged], 1.0 - kept)
-        self._last = {"loss": values[0], "gradient_norm": values[1], "lr": self._rates[0] * factor}
+        self._last = {
+            "num_steps": batch.rgbs.shape[1],
+            "loss": values[0],
+            "gradient_norm": values[1],
+            "lr": self._rates[0] * factor,
+        }
 
     def _expected_updates(self) -> int:
         """Return how many updates the phase will have at the pace so far."""

@@ -182,6 +182,17 @@ def test_candidates_from_one_moment_are_advanced_once_until_one_touches_a_body(m
     assert not torch.equal(following.positions[2], following.positions[0])
 
 
+def test_pasts_that_part_are_not_those_of_members_that_rest() -> None:
+    made, motions = model(skip_resting=True), [plate(-0.6, 0.0), plate(-0.11, 0.02), plate(-0.11, 0.03)]
+    first, keys = replace(cube_on_a_table(), driven=motions[0]), RandomKeys.fixed(3)
+    with torch.no_grad():
+        memory = expanded(made.initialize(first, first, RandomKeys.fixed(1)), 3)
+        memory = replace(memory, past=torch.tensor([1, 0, 0]))  # the first one rests
+        current = replace(expanded(cube_on_a_table(), 3), driven=joined(*motions))
+        _, memory = made(current, current, memory, keys, 0)
+    assert memory.past[0] == 1 and len(memory.past.unique()) == 3
+
+
 def test_with_gradients_nothing_is_skipped() -> None:
     made = model(skip_resting=True)
     calls = []

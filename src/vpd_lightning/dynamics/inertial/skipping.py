@@ -54,16 +54,27 @@ def step_where_it_moves(
     rows = (~is_idle).nonzero()[:, 0]
     if len(rows) == 0:
         return current, memory
+    unused = memory.past.max() + 1 + torch.arange(count, device=memory.past.device)
+    given = current, memory, positions, driven, unused
     if len(rows) == count:
-        return _step_of_alike(step, touches, current, memory, positions, driven)
-    some = rows_of((current, memory, positions, driven), rows, count)
+        return _step_of_alike(step, touches, *given)
+    some = rows_of(given, rows, count)
     return with_rows((current, memory), rows, some[:2], _step_of_alike(step, touches, *some), count)
 
 
 def _step_of_alike(
-    step: Step, touches: Touches, current: Particles, memory: InertialMemory, positions: Tensor, driven: Driven | None
+    step: Step,
+    touches: Touches,
+    current: Particles,
+    memory: InertialMemory,
+    positions: Tensor,
+    driven: Driven | None,
+    unused: Int64[Tensor, " batch"],
 ) -> State:
-    """Advance one of all that are alike and touch nothing driven, and each of the others."""
+    """Advance one of all that are alike and touch nothing driven, and each of the others.
+
+    ``unused`` are numbers of pasts that no member has, of those that are left out neither.
+    """
     count = len(current.mask)
     own = torch.arange(count, device=memory.past.device)
     source = _first_alike(memory, positions)
@@ -74,7 +85,7 @@ def _step_of_alike(
         rows, place = torch.unique(source, return_inverse=True)
         touched = touches(*rows_of((current, memory), rows, count), driven, place)
         # Two that were one go apart: each has a past of its own from here on.
-        past = torch.where(touched, past.max() + 1 + own, past)
+        past = torch.where(touched, unused, past)
         source = torch.where(touched, own, _first_alike(replace(memory, past=past), positions))
     rows, place = torch.unique(source, return_inverse=True)
     few, before = rows_of((current, memory), rows, count)
