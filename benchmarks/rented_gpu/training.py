@@ -184,8 +184,8 @@ class Training:
 
     def _next_phase(self) -> None:
         """Go on with the average of the weights, which is what the end of a training of ``vpd-train`` hands over."""
-        state = {name: value.detach() for name, value in self.system.state_dict().items()}
-        self.progress.weights = {**state, **self._average}
+        self.system.load_state_dict(self._average, strict=False)
+        self.progress.weights = {name: value.detach() for name, value in self.system.state_dict().items()}
         self.progress.second_moments, self.progress.average = {}, {}
         self.progress.phase, self.progress.step, self.progress.phase_seconds = self.progress.phase + 1, 0, 0.0
         self._average = {}

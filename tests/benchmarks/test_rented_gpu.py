@@ -118,9 +118,20 @@ def test_time_ends_phases_and_weights_are_averaged(pack: Path, tmp_path: Path, m
     training = Training(phases, trajectories, torch.device("cpu"), 0, progress, seconds_in_all=1000.0)
     monkeypatch.setattr(training, "_count", lambda _, count=training._count: count(60.0))  # an update takes a minute
 
+    averages: list[dict[str, torch.Tensor]] = []
+
+    def next_phase(call=training._next_phase) -> None:
+        averages.append({name: value.clone() for name, value in training._average.items()})
+        call()
+
+    monkeypatch.setattr(training, "_next_phase", next_phase)
+
     training.run(float("inf"), tmp_path, 1e9)
 
     assert training.is_done
+    written = read_progress(tmp_path).weights
+    for name, value in averages[-1].items():
+        torch.testing.assert_close(written[name], value, rtol=1e-4, atol=1e-7)  # kept with 15 bits
     lengths = {point["step"]: point["num_steps"] for point in progress.curve if point["phase"] == 1}
     assert (lengths[1], lengths[10]) == (1, 2)
     assert training.num_taken == sum(math.ceil(1000 * phase["share"] / 60) for phase in phases)
