@@ -1,9 +1,11 @@
 """Recordings and settings in one small file: what a machine without this project's tools needs for a training.
 
 Cameras stand still, so most pixels of a frame are those of the camera's median image, and what is left compresses well:
-images are stored without loss as their difference from it. Depth is kept for the input cameras alone, in float32.
+images are stored without loss as their difference from it. Depth is kept for the input cameras alone, in float32, and
+actions as they are recorded.
 """
 
+import io
 import json
 import lzma
 from collections.abc import Mapping, Sequence
@@ -32,6 +34,7 @@ class PackedTrajectory:
     packed_depth: Mapping[int, Float32[np.ndarray, "time height width"]]
     intrinsics: Float[np.ndarray, "view 3 3"]
     cam_to_world: Float[np.ndarray, "view 4 4"]
+    action: DrivenMotion | None = None
     use_cache: bool = True
 
     @property
@@ -67,8 +70,8 @@ class PackedTrajectory:
         return intrinsics, cam_to_world
 
     def driven(self, times: Sequence[int]) -> DrivenMotion | None:
-        """Return None: a packed set has no actions."""
-        return None
+        """Return the given motion at the given frames; None where the recording has none."""
+        return None if self.action is None else self.action.at(times)
 
 
 def write_pack(
@@ -111,10 +114,13 @@ def write_pack(
     fitted = 0
     for trajectory in trajectories:
         packed = _packed(trajectory, views, sorted(input_views), base_rgb, base_depth)
-        needed = len(packed) + _OVERHEAD
+        action = _packed_action(trajectory)
+        needed = len(packed) + len(action) + 2 * _OVERHEAD
         if size + needed > limit_bytes:
             break
         arrays[f"trajectory_{fitted}"] = np.frombuffer(packed, np.uint8)
+        if action:
+            arrays[f"action_{fitted}"] = np.frombuffer(action, np.uint8)
         size += needed
         fitted += 1
     if not fitted:
@@ -145,12 +151,17 @@ def read_pack(path: Path) -> tuple[dict[str, Any], list[PackedTrajectory]]:
         shared = {name: archive[name] for name in ("views", "base_rgb", "base_depth", "intrinsics", "cam_to_world")}
         lengths = archive["num_frames"]
         packed = [archive[f"trajectory_{number}"].tobytes() for number in range(len(settings["names"]))]
+        actions = [
+            _unpacked_action(archive[name].tobytes()) if (name := f"action_{number}") in archive else None
+            for number in range(len(packed))
+        ]
     views = [int(view) for view in shared["views"]]
     with_depth = [view for view in views if view in settings["input_views"]]
     found = []
-    for name, length, content in zip(settings["names"], lengths, packed, strict=False):
+    for name, length, content, action in zip(settings["names"], lengths, packed, actions, strict=False):
         rgb, depth = _unpacked(content, int(length), views, with_depth, shared["base_rgb"], shared["base_depth"])
-        found.append(PackedTrajectory(Path(name), rgb, depth, shared["intrinsics"], shared["cam_to_world"]))
+        cameras = shared["intrinsics"], shared["cam_to_world"]
+        found.append(PackedTrajectory(Path(name), rgb, depth, *cameras, action))
     return settings, found
 
 
@@ -170,6 +181,21 @@ def _packed(
         bits = trajectory.depth(times, [view])[:, 0].view(np.uint32) ^ base_depth[views.index(view)].view(np.uint32)
         parts.append(np.ascontiguousarray(bits.reshape(-1).view(np.uint8).reshape(-1, 4).T).tobytes())
     return lzma.compress(b"".join(parts), preset=_PRESET)
+
+
+def _packed_action(trajectory: FrameSource) -> bytes:
+    """Pack what ``action/`` of the recording's file holds; empty where it has none."""
+    driven = trajectory.driven(range(trajectory.num_frames))
+    if driven is None:
+        return b""
+    content = io.BytesIO()
+    np.savez(content, **driven.as_arrays())
+    return lzma.compress(content.getvalue(), preset=_PRESET)
+
+
+def _unpacked_action(packed: bytes) -> DrivenMotion:
+    with np.load(io.BytesIO(lzma.decompress(packed))) as archive:
+        return DrivenMotion(**archive)
 
 
 def _unpacked(

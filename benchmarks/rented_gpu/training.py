@@ -26,7 +26,7 @@ _WITHOUT_END = 1_000_000  # updates, more than time allows
 STAGES = ("encoder", "dynamics", "renderer")
 CLIPS = (
     "seed", "batch_size", "num_steps", "num_steps_schedule", "rays_per_step", "input_views", "target_views",
-    "start_frames", "load_future",
+    "start_frames", "load_future", "load_driven",
 )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from benchmarks.rented_gpu import __main__ as rented_gpu
 from benchmarks.rented_gpu.packing import read_pack
 from benchmarks.rented_gpu.progress import Progress, read_progress, write_progress
 from benchmarks.rented_gpu.training import Training, build_system
+from tests.evaluation.pushed_box import write_pushed_boxes
 from vpd_lightning.config import build, compose
 from vpd_lightning.config.building import build_simulator
 from vpd_lightning.data.frames import TrajectoryFrames
@@ -236,3 +237,24 @@ def test_what_the_loop_does_not_offer_is_refused(words: list[str], tmp_path: Pat
     assert "--updates needs 2 numbers" in capsys.readouterr().err
     assert rented_gpu.main([*out, "1,1", *words, "data.moving_ray_fraction=0.5"]) == 1
     assert "moving_ray_fraction=0" in capsys.readouterr().err
+
+
+def test_actions_travel_and_are_trained_on(tmp_path: Path):
+    data = write_pushed_boxes(tmp_path / "data")
+    pack = tmp_path / "pack.npz"
+    more = [f"data.folder={data}", "actions=true", "scene.input_views=[0]", "data.target_views=[0,1]"]
+    assert rented_gpu.main(["pack", "--out", str(pack), "--updates", "1,1", *WORDS, *more]) == 0
+    (file,) = load_manifest(data).split("train")
+    _, (packed,) = read_pack(pack)
+    frames = TrajectoryFrames(file, use_cache=False)
+    mine, theirs = packed.driven([3, 1]), frames.driven([3, 1])
+    assert mine is not None and theirs is not None
+    assert mine.as_arrays().keys() == theirs.as_arrays().keys()
+    for name, values in theirs.as_arrays().items():
+        np.testing.assert_array_equal(mine.as_arrays()[name], values)
+
+    assert train(pack, tmp_path / "state") == 0
+    settings, _ = read_pack(pack)
+    first, last = build_system(settings["phases"][-1]).state_dict(), read_progress(tmp_path / "state").weights
+    of_action = [name for name in last if "driven" in name]
+    assert of_action and not all(torch.allclose(first[name], last[name], atol=1e-5) for name in of_action)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,13 +10,10 @@ import pytest
 
 pytest.importorskip("viser")
 
-from tests.data.recordings import write_dataset_file
-from tests.evaluation.tossed_box import tossed_box
+from tests.evaluation.pushed_box import BELOW, STEP, write_pushed_boxes
 from tests.evaluation.untrained_model import write_untrained
 from tests.viewer.clients import camera_message, drain, settled_panel, socket_of
 from tests.waiting import wait_until
-from vpd_lightning.data.driven_motion import DrivenMotion
-from vpd_lightning.data.schema import write_trajectory
 from vpd_lightning.editing.operations import Move
 from vpd_lightning.editing.selectors import Everything
 from vpd_lightning.errors import ActionError, EditError
@@ -26,22 +22,6 @@ from vpd_lightning.viewer.opened_scene import OpenedScene, open_scene
 from vpd_lightning.viewer.panel import Panel
 from vpd_lightning.viewer.server import Viewer
 from vpd_lightning.viewer.session import Session
-
-BELOW = -0.9  # the tool is under the floor, where no camera could see through it
-STEP = 0.02
-
-
-def write_pushed_boxes(folder: Path) -> Path:
-    box = tossed_box(100)
-    poses = np.tile(np.eye(4), (len(box.rgb), 1, 1, 1))
-    poses[:, 0, 0, 3] = STEP * np.arange(len(poses))
-    points = 0.01 * np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]) + [0, 0, BELOW]
-    motion = DrivenMotion.carried(points, np.tile([0.0, 0, 1], (4, 1)), np.zeros(4, np.int32), poses, poses)
-    files = {}
-    for split in ("train", "test"):
-        files[split] = [folder / split / "000000.h5"]
-        write_trajectory(files[split][0], replace(box, action=motion.as_arrays()))
-    return write_dataset_file(folder, {**files, "validation": []})
 
 
 @pytest.fixture(scope="module")
