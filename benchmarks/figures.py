@@ -29,7 +29,7 @@ PLACES = (
     "released/{}/metrics.json",
     "docs/results/{}/report.csv",
 )
-FIGURE = re.compile(r"(?P<number>-?\d[\d,]*(?:\.\d+)?)(?P<between>\**)<!-- figure: (?P<source>.*?) -->")
+FIGURE = re.compile(r"(?P<number>-?\d[\d,]*(?:\.\d+)?(?:e-?\d+)?)(?P<between>\**)<!-- figure: (?P<source>.*?) -->")
 
 
 def with_figures(text: str) -> str:
@@ -86,8 +86,11 @@ def content_of(path: Path) -> Any:
 
 
 def _again(match: re.Match[str]) -> str:
-    number = match["number"]
+    number, _, power = match["number"].partition("e")
     digits = len(number.partition(".")[2])
+    if power:
+        mantissa, _, power = format(value_of(match["source"]), f".{digits}e").partition("e")
+        return f"{mantissa}e{int(power)}"
     return format(value_of(match["source"]), f"{',' if ',' in number else ''}.{digits}f")
 
 

@@ -155,3 +155,8 @@ def test_digits_and_thousands_stay_as_they_are_printed() -> None:
     assert with_figures(text.replace("x -->", "paper_size_step_cpu > peak_bytes in GiB -->").replace("155", "000")) == (
         text.replace("x -->", "paper_size_step_cpu > peak_bytes in GiB -->")
     )
+
+
+def test_numbers_with_an_exponent_are_written_anew_with_it() -> None:
+    source = "<!-- figure: gpu_knn_cuda > rows > knn/auto > error --> m"
+    assert with_figures(f"off by 9.9e-3{source}") == f"off by 1.5e-7{source}"
