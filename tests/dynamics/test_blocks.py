@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch import nn
 
 from vpd_lightning.dynamics.blocks import MLP, EdgeUpdater, FullPrecisionLayerNorm, NodeUpdater
 from vpd_lightning.graph.hierarchical import EdgeSet
@@ -71,10 +72,18 @@ def test_a_node_with_features_keeps_a_residual() -> None:
     torch.testing.assert_close(updater(nodes, messages), expected)
 
 
-def test_layer_norm_stays_in_float32_under_autocast() -> None:
-    norm = FullPrecisionLayerNorm(8)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert norm(torch.randn(3, 8).bfloat16()).dtype == torch.float32
+@pytest.mark.parametrize("is_autocast", [False, True])
+def test_layer_norm_of_bfloat16_is_computed_in_float32_and_rounded_once(is_autocast: bool) -> None:
+    norm = FullPrecisionLayerNorm(64)
+    with torch.no_grad():
+        norm.weight.uniform_(0.5, 2)
+        norm.bias.normal_()
+    inputs = (100 + torch.randn(50, 64)).bfloat16()  # whose variance bfloat16 could not tell
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=is_autocast):
+        outputs = norm(inputs)
+    assert outputs.dtype == torch.bfloat16
+    exact = nn.functional.layer_norm(inputs.double(), (64,), norm.weight.double(), norm.bias.double(), norm.eps)
+    torch.testing.assert_close(outputs.double(), exact, rtol=2**-8, atol=1e-3)
 
 
 def test_impossible_sizes_are_refused() -> None:

@@ -45,12 +45,19 @@ class MLP(nn.Module):
 
 
 class FullPrecisionLayerNorm(nn.LayerNorm):
-    """Layer norm in at least float32, also under autocast and also for empty inputs."""
+    """Layer norm computed in at least float32, also under autocast; the result is in the inputs' precision.
+
+    PyTorch's autocast would return float32, and all latents, which are sums of such results, would be float32, too:
+    products in bfloat16 then read and write twice the bytes.
+    """
 
     def forward(self, inputs: Float[Tensor, "*shape feature"]) -> Float[Tensor, "*shape feature"]:
         """Normalise over the last axis."""
+        is_half = inputs.dtype in (torch.float16, torch.bfloat16)
         with torch.autocast(inputs.device.type, enabled=False):
-            return super().forward(inputs.float() if inputs.dtype in (torch.float16, torch.bfloat16) else inputs)
+            if is_half and inputs.device.type != "cpu":  # on a CPU one kernel computes so by itself
+                return super().forward(inputs.float()).to(inputs.dtype)
+            return super().forward(inputs)
 
 
 class EdgeUpdater(nn.Module):
@@ -94,8 +101,8 @@ class EdgeUpdater(nn.Module):
 
     def _behind_nodes(self, edges: Tensor, weight: Tensor, hidden: Tensor) -> Tensor:
         """Return what is added to the edges, given the nodes' part of the first layer, which is overwritten."""
-        if torch.is_autocast_enabled(edges.device.type):
-            hidden = hidden + functional.linear(edges, weight)
+        if torch.is_autocast_enabled(edges.device.type):  # which does not know the form in place
+            hidden = torch.addmm(hidden, edges, weight.t())
         else:
             hidden = hidden.addmm_(edges, weight.t())
         return self.norm(self.mlp.after_first(hidden))
