@@ -13,6 +13,7 @@ from vpd_lightning.geometry.occluders import MOST_OCCLUDERS, occluders_of, thinn
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.background import DARKEST, Background, UnseenGround
 from vpd_lightning.renderer.base import AbstractRenderer
+from vpd_lightning.renderer.kernel_weights import kernel_weights
 from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.renderer.scenery_layer import SceneryLayer, SeenScenery
@@ -334,22 +335,17 @@ class SplatRenderer(AbstractRenderer):
             memberships = memberships + torch.where(known, hidden, 0.0)[:, :, None]
         # What cannot be used, in particular what is behind the camera, counts for nothing at all.
         memberships = memberships.masked_fill(~usable[:, :, None], -1e30)
-        there = usable[:, :, None].to(along.dtype)
-        scales = torch.tensor(self.kernel_scales, dtype=along.dtype, device=along.device)[:, None]
-        logits = memberships[:, :, :, None] - (square[:, :, None] / (2 * scales.square()))[:, :, None]
-        top = logits.detach().amax(dim=-1, keepdim=True)
-        kernels = decay(logits - top) * there[:, :, :, None]
-        total = kernels.sum(dim=-1, keepdim=True).clamp(min=1e-30)  # at least 1, but where nothing is usable
-        weights = kernels / total
+        scales = torch.tensor(self.kernel_scales, dtype=along.dtype, device=along.device)
+        weights, log_total = kernel_weights(memberships, square, usable, scales)
         # One product for all layers and scales: (layer * scale, candidate) @ (candidate, channel) of each ray.
         features, offsets = (
-            (weights.flatten(2, 3) @ values).unflatten(2, logits.shape[2:4])
+            (weights.flatten(2, 3) @ values).unflatten(2, weights.shape[2:4])
             for values in (gather(particles.features), beside)
         )
         distances = (weights[:, :, :, 0] * along[:, :, None]).sum(dim=-1)
-        visible = (top + torch.log(total)).clamp(min=-10.0) / 5
-        density = torch.log1p((decay(memberships) * there).sum(dim=-1, keepdim=True))
-        inputs = torch.cat([features, offsets / scales, visible], dim=-1).flatten(3)
+        visible = log_total.clamp(min=-10.0) / 5
+        density = torch.log1p((decay(memberships) * usable[:, :, None]).sum(dim=-1, keepdim=True))
+        inputs = torch.cat([features, offsets / scales[:, None], visible], dim=-1).flatten(3)
         inputs = torch.cat([inputs, density], dim=-1).flatten(2)
         return inputs, distances, usable.any(dim=-1, keepdim=True)
 
