@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from tests.waiting import HANG
 from vpd_lightning.config import build_simulator, compose
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.release.renderer_program import export_renderer, write_program
-from vpd_lightning.types import Particles, Rays
+from vpd_lightning.types import Driven, Particles, Rays
 
 NUM_PARTICLES, FEATURE_DIM, NUM_RAYS = 300, 8, 200
 
@@ -59,6 +60,16 @@ def test_a_program_draws_what_the_renderer_draws_without_this_package(tmp_path: 
         for mine, theirs in zip((drawn.rgbs, drawn.depths, drawn.opacities), program(*inputs), strict=True):
             torch.testing.assert_close(theirs, mine, rtol=1e-4, atol=1e-4)
         assert num_valid == 0 or (drawn.opacities.mean() > 0.5 and drawn.depths.std() > 0.01), "there is something"
+    positions, features, mask, *lines = scene(3, NUM_PARTICLES)
+    given = Driven(positions[:, 200:], torch.ones_like(positions[:, 200:]), mask[:, 200:].long())
+    given = replace(given, features=features[:, 200:])
+    some = Particles(positions[:, :200], features[:, :200], mask[:, :200], driven=given)
+    shown = some.with_driven()
+    with torch.no_grad():
+        with_tool, without = (built(seen, Rays(*lines), None) for seen in (some, replace(some, driven=None)))
+    from_program = program(shown.positions, shown.features, shown.mask, *lines)
+    torch.testing.assert_close(from_program[0], with_tool.rgbs, rtol=0, atol=1e-3)
+    assert (with_tool.rgbs - without.rgbs).abs().max() > 0.01
     torch.save(inputs, tmp_path / "inputs.pt")
     files = [str(tmp_path / name) for name in ("renderer.pt2", "inputs.pt", "drawn.pt")]
     subprocess.run([sys.executable, "-c", CALLER, *files], check=True, cwd=tmp_path, timeout=HANG)
