@@ -139,6 +139,11 @@ class PushingSettings(SceneSettings):
         require(fits, "arm.links", list(arm.links), f"a reach ({reach}) that covers {limit} m about the origin")
 
     @property
+    def pusher_lag(self) -> float:
+        """Frames by which the pusher follows a moving place that it is told, one at most: damping over stiffness."""
+        return min(1.0, self.pusher.damping / self.pusher.stiffness / self.frame_time)
+
+    @property
     def arm_height(self) -> float:
         """Height of the arm's links above the table, metres: the pusher hangs from them."""
         return self.pusher_height + self.pusher.length / 2 + self.arm.radius

@@ -46,6 +46,7 @@ def test_it_plans_acts_and_films(run: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in out.iterdir()) == ["plan.json", "plan.webm"]
     found = json.loads((out / "plan.json").read_text())
     assert len(found["seconds_per_decision"]) == len(found["costs"]) == 2 and len(found["places"]) == 3
+    assert found["contact"] == {"num_probes": 64, "num_contact_substeps": 2}
     assert found["task"] == "make_room" and found["seed"] == 1000 and not found["solved"]
 
 
@@ -74,6 +75,7 @@ def test_the_recorded_action_is_given_to_evaluations_and_films(run: Path, tmp_pa
         ("solver.num_samples=0", "solver.num_samples and num_iterations are"),
         ("num_executed=9", "num_executed=9 actions cannot be taken of a plan of 6"),
         ("num_decisions=0", "num_decisions=0 is out of range"),
+        ("contact.num_probes=0", "contact.num_probes=0 is out of range"),
         ("max_speed=0", "must be above 0"),
         ("preset=huge", "huge"),
         ("backend=pencil", "Allowed: auto, egl, osmesa."),

@@ -54,8 +54,7 @@ def loop_of(solver_name: str, settings: PushingSettings, num_samples: int) -> Lo
         if solver_name == "random"
         else CrossEntropy(num_samples, NUM_ITERATIONS, NUM_ELITES, SPREAD)
     )
-    lag = settings.pusher.damping / settings.pusher.stiffness / settings.frame_time
-    tool = PlanarTool(MAX_SPEED, low=(-limit).tolist(), high=limit.tolist(), hold=HOLD, lag=lag)
+    tool = PlanarTool(MAX_SPEED, (-limit).tolist(), limit.tolist(), HOLD, settings.pusher_lag)
     return Loop(tool, solver, NUM_KNOTS, NUM_EXECUTED, NUM_DECISIONS)
 
 

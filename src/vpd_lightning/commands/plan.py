@@ -46,6 +46,7 @@ def _plan(config: Mapping[str, Any]) -> None:
             f"{model.path} was trained without actions, so it cannot plan any.\n"
             "Train one: vpd-train experiment=pushing model=inertial encoder=unet_moving."
         )
+    _set_contact(model.simulator.dynamics, config["contact"])
     backend = _backend(config["backend"]) if config["system"] == "model" else None
     from data_gen.pushing.world import PushingWorld  # after MUJOCO_GL is set
 
@@ -66,7 +67,7 @@ def _plan(config: Mapping[str, Any]) -> None:
             details = {
                 "checkpoint": str(model.path),
                 "checkpoint_sha256": model.sha256,
-                **{name: config[name] for name in ("task", "seed", "preset", "system", "solver", "max_speed")},
+                **{name: config[name] for name in ("task", "seed", "preset", "system", "solver", "contact", "max_speed")},
             }
             write_episode(partial, model.simulator, world, task, episode, details, config["fps"])
     finally:
@@ -75,6 +76,15 @@ def _plan(config: Mapping[str, Any]) -> None:
     seconds = f", {np.mean(episode.seconds):.1f} s a decision" if episode.seconds else ""
     print(f"{config['task']}, world {config['seed']}, by {config['system']}: {words}{seconds}")
     print(folder)
+
+
+def _set_contact(dynamics: Any, contact: Mapping[str, int | None]) -> None:
+    """Have a dynamics that resolves contact do so as coarsely as is asked for; others have no such settings."""
+    for name, value in contact.items():
+        if value is not None and value < 1:
+            raise ConfigError(f"contact.{name}={value} is out of range.\nAllowed: 1 or more, or null: as trained.")
+        if value is not None and hasattr(dynamics, name):
+            setattr(dynamics, name, value)
 
 
 def _print_decision(number: int, total: int, cost: float) -> None:
@@ -123,9 +133,8 @@ def _loop(config: Mapping[str, Any], settings: Any) -> Any:
     except ValueError as error:
         raise ConfigError(f"{error}.\nCorrect the solver's settings.") from error
     limit = (np.asarray(settings.table.half_size) + settings.pusher.overhang).tolist()
-    # Position control follows a moving place by damping over stiffness (seconds).
-    lag = min(1.0, settings.pusher.damping / settings.pusher.stiffness / settings.frame_time)
-    tool = PlanarTool(config["max_speed"] * settings.frame_time, [-x for x in limit], limit, config["hold"], lag)
+    speed = config["max_speed"] * settings.frame_time
+    tool = PlanarTool(speed, [-x for x in limit], limit, config["hold"], settings.pusher_lag)
     return Loop(tool, solver, config["num_knots"], config["num_executed"], config["num_decisions"])
 
 

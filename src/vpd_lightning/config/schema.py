@@ -215,6 +215,14 @@ class SolverConfig:
 
 
 @dataclass
+class ContactConfig:
+    """How finely contact is resolved while planning."""
+
+    num_probes: int | None = MISSING
+    num_contact_substeps: int | None = MISSING
+
+
+@dataclass
 class PlanConfig(TrainedModelConfig):
     """Root of ``vpd-plan``."""
 
@@ -223,6 +231,7 @@ class PlanConfig(TrainedModelConfig):
     preset: str = MISSING
     system: str = MISSING
     solver: SolverConfig = MISSING
+    contact: ContactConfig = MISSING
     num_knots: int = MISSING
     hold: int = MISSING
     num_executed: int = MISSING
