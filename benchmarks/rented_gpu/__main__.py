@@ -5,14 +5,16 @@ r"""Training on a rented GPU machine, in pieces of a few minutes.
         experiment=mujoco_block model=vpd_staged budget=hour data.folder=DATA
 
     # on the machine with the GPU: needs torch and what the core imports (numpy, scipy, jaxtyping); PYTHONPATH=.:src
-    python -m benchmarks.rented_gpu train --pack pack.npz --out OUT --minutes 9 [--resume OUT]
+    python -m benchmarks.rented_gpu train --pack pack.npz --out OUT --minutes 9 [--resume OUT | --weights STATE]
 
     # back at home: a run folder for vpd-eval, vpd-view, vpd-export and pretraining.ckpt
     python -m benchmarks.rented_gpu run --pack pack.npz --state OUT --folder RUN
 
 Words without dashes are those of vpd-train. ``pack`` takes as many training trajectories as fit. A model that is
 trained in two trainings needs two numbers of ``--updates``. ``train`` stops after its minutes, leaves at most seven
-files of 15 MiB and ``curve.json`` in ``--out``, and goes on from there with ``--resume``, there or elsewhere.
+files of 15 MiB and ``curve.json`` in ``--out``, and goes on from there with ``--resume``, there or elsewhere. With
+``--weights`` the last training begins with the weights of another state, which may be of another pack: other lengths
+of clips, another data set, another loss.
 """
 
 import argparse
@@ -39,7 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
     train = commands.add_parser("train", help="train for some minutes")
     train.add_argument("--pack", type=Path, required=True)
     train.add_argument("--out", type=Path, required=True)
-    train.add_argument("--resume", type=Path, help="folder with the state to go on from")
+    start = train.add_mutually_exclusive_group()
+    start.add_argument("--resume", type=Path, help="folder with the state to go on from")
+    start.add_argument("--weights", type=Path, help="folder with a state whose weights the last training begins with")
     train.add_argument("--minutes", type=float, default=9.0, help="until it stops")
     train.add_argument("--minutes-in-all", type=float, help="of all phases, earlier calls counted in; not --updates")
     train.add_argument("--seed", type=int, help="another one than the pack's; kept on resume")
@@ -133,13 +137,18 @@ def _train(options: argparse.Namespace) -> None:
     import torch
 
     from benchmarks.rented_gpu.packing import read_pack
-    from benchmarks.rented_gpu.progress import Progress, read_progress
+    from benchmarks.rented_gpu.progress import Progress, beginning_with, read_progress
     from benchmarks.rented_gpu.training import Training
 
     deadline = time.perf_counter() + 60 * options.minutes
     settings, trajectories = read_pack(options.pack)
     print(f"{len(trajectories)} trajectories unpacked", flush=True)
-    progress = read_progress(options.resume) if options.resume else Progress(seed=options.seed)
+    if options.resume:
+        progress = read_progress(options.resume)
+    elif options.weights:
+        progress = beginning_with(read_progress(options.weights), len(settings["phases"]) - 1, options.seed)
+    else:
+        progress = Progress(seed=options.seed)
     in_all = None if options.minutes_in_all is None else 60 * options.minutes_in_all
     training = Training(
         _changed(settings["phases"], progress.seed, options.clips),

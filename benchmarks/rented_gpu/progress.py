@@ -37,6 +37,11 @@ class Progress:
     seed: int | None = None  # where it is not the pack's
 
 
+def beginning_with(other: Progress, phase: int, seed: int | None) -> Progress:
+    """Return the beginning of a phase with another training's weights: their average, where it kept one."""
+    return Progress(phase=phase, weights={**other.weights, **other.average}, seed=seed)
+
+
 def write_progress(folder: Path, progress: Progress) -> list[Path]:
     """Write ``state_<i>_of_<n>.bin`` and ``curve.json`` in the place of an earlier state's; return their paths.
 

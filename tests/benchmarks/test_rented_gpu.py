@@ -224,6 +224,20 @@ def test_another_seed_is_that_of_the_run(pack: Path, tmp_path: Path):
     assert (config["seed"], config["data"]["seed"]) == (5, 5)
 
 
+def test_the_last_training_begins_with_other_weights(pack: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert train(pack, tmp_path / "first") == 0
+    begun: list[Training] = []
+    monkeypatch.setattr(Training, "run", lambda self, *_: begun.append(self))
+
+    assert train(pack, tmp_path / "second", "--weights", str(tmp_path / "first"), "--seed", "5") == 0
+
+    (training,) = begun
+    assert (training.progress.phase, training.progress.step, training.progress.seed) == (1, 0, 5)
+    state = read_progress(tmp_path / "first")
+    for name, value in training.system.state_dict().items():
+        torch.testing.assert_close(value, {**state.weights, **state.average}[name], rtol=0, atol=0)
+
+
 def test_an_update_can_be_profiled(pack: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     assert train(pack, tmp_path / "state", "--profile", "1", "--minutes-in-all", "9") == 0
     printed = capsys.readouterr().out
