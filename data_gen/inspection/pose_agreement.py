@@ -2,8 +2,8 @@
 
 Noise hides a wrong pose from single points, and not from all of them together: the points of one view are moved
 rigidly onto the surfaces that another view sees there (point to plane, Chen and Medioni 1992, one linear step), and how
-far they are moved is compared with how surely it is known. What the surfaces do not determine, as sliding along a bare
-floor, counts as right.
+far they are moved is compared with how surely it is known. What the surfaces do not determine, as sliding along a
+table, is told by colours (``color_agreement``); what neither determines counts as right.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from data_gen.inspection.color_agreement import ColoredView, slide
 from data_gen.inspection.posed_depth import Array, PosedDepth, choose_pairs, rays, read_posed_depth
 from data_gen.inspection.smooth_surface import SmoothSurface, smooth_surface
 from vpd_lightning.data.reader import TrajectoryReader
@@ -26,6 +28,9 @@ _SPACING = 3  # pixels between points: nearer ones err alike
 _REACH = 0.1  # of the depth: farther apart are other surfaces
 _NUM_ROUNDS, _INLIER = 4, 3.0  # fits, and standard deviations within which points count
 _KEPT = 0.015  # of the depth: so far off points always count, or a bare floor would outvote all that stands on it
+_OPEN = 0.02  # share of the points that face a motion below which it is asked of colours
+_MUTUAL = 0.5  # share of a slide by which those of either view to the other differ at most
+_MOST_COLORED = 5000  # points of a moment
 _TELLING = 20.0  # points that face a motion, or as many more that it passes at an angle; fewer say nothing of it
 
 
@@ -34,18 +39,25 @@ class Misplacement:
     """The rigid motion that brings one view's surfaces onto another's: its surest part, a shift or a turn.
 
     ``distance`` is metres, of a turn at the mean distance from the points' centre; ``error`` is its standard error,
-    ``depth`` the median depth of the points, all in metres.
+    ``depth`` the median depth of the points, all in metres. ``evidence`` says what lies apart: surfaces or colours.
     """
 
     views: tuple[int, int]
     distance: float
     error: float
     depth: float
+    evidence: str = "surfaces"
+    shift: tuple[float, ...] = ()  # of colours, metres in the world
 
     @property
     def is_certain(self) -> bool:
         """Whether it is surely more than a calibration leaves."""
-        return self.distance > MAX_MISPLACED * self.depth + _SURE * self.error
+        return self.excess > 0
+
+    @property
+    def excess(self) -> float:
+        """Metres that it is surely more than a calibration leaves, negative where it is not."""
+        return self.distance - MAX_MISPLACED * self.depth - _SURE * self.error
 
 
 class SurfaceOffsets(NamedTuple):
@@ -56,12 +68,21 @@ class SurfaceOffsets(NamedTuple):
         normals: (point, 3), world.
         distances: (point,), metres along the normal to the other view's surface.
         depth: (point,), metres, of the point in its own view.
+        pixels: (point, 2), row and column of the point in its own view.
     """
 
     points: Array
     normals: Array
     distances: Array
     depth: Array
+    pixels: NDArray[np.int64]
+
+    def every(self, stride: int) -> "SurfaceOffsets":
+        """Return one of ``stride`` points."""
+        some = slice(None, None, stride)
+        return SurfaceOffsets(
+            self.points[some], self.normals[some], self.distances[some], self.depth[some], self.pixels[some]
+        )
 
 
 def misplacements(reader: TrajectoryReader, max_pairs: int) -> list[Misplacement]:
@@ -83,46 +104,94 @@ def misplacements(reader: TrajectoryReader, max_pairs: int) -> list[Misplacement
             for time in times
         ]
         joined = SurfaceOffsets(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-        found.append(_misplacement((first, second), joined))
-    return [item for item in found if item is not None]
+        found += _misplacement((first, second), joined)
+    if any(item.is_certain for item in found):
+        return found
+    # Surfaces are right as far as they tell; the rest is asked of colours, at the first and the middle moment.
+    for first, second in pairs:
+        parts, seen = [], []
+        for time in times[:: max(1, len(times) // 2)][:2]:
+            key, other = (time, first), (time, second)
+            part = surface_offsets(images[key], surfaces[key], images[other], surfaces[other], spacing=1)
+            part = part.every(1 + len(part.points) // _MOST_COLORED)
+            rgb, other_rgb = (reader.rgb([time], [view])[0, 0] for view in (first, second))
+            parts.append(part)
+            seen.append(ColoredView(part.points, part.pixels, rgb, images[other], other_rgb))
+        joined = SurfaceOffsets(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        found += _slide((first, second), joined, seen)
+    return [item for item in found if not item.shift or _is_mutual(item, found)]
 
 
 def outlier_view(found: Sequence[Misplacement]) -> tuple[int, Misplacement] | None:
     """Return the view whose pairs are farthest off, with its worst pair; None where no pair is certain.
 
-    A pair counts where it is certain either way around: from its first view's points, and from its second's.
+    A pair counts where it is certain either way around: from its first view's points, and from its second's. Colours
+    count where most comparisons of that view, and two at least, say so.
     """
-    either = {item.views: item for item in found}
-    certain = [item for item in found if item.is_certain and either.get(item.views[::-1], item).is_certain]
+    either = {(*item.views, item.evidence): item for item in found}
+    certain = [
+        item for item in found if item.is_certain and either.get((*item.views[::-1], item.evidence), item).is_certain
+    ]
     if not certain:
         return None
     off = {view: [item.distance for item in found if view in item.views] for item in certain for view in item.views}
     worst = max(off, key=lambda view: float(np.median(off[view])))
-    return worst, max((item for item in certain if worst in item.views), key=lambda item: item.distance)
-
-
-def _misplacement(views: tuple[int, int], offsets: SurfaceOffsets) -> Misplacement | None:
-    points, normals, residuals, depth = offsets
-    if len(points) < _MIN_POINTS:
+    pair = max((item for item in certain if worst in item.views), key=lambda item: item.distance)
+    alike = [item.excess for item in found if worst in item.views and item.evidence == pair.evidence]
+    if pair.evidence == "colours" and (np.median(alike) <= 0 or sum(excess > 0 for excess in alike) < 2):
         return None
-    center = points.mean(axis=0)
-    radius = float(np.sqrt(((points - center) ** 2).sum(axis=1).mean()))
-    # Columns: translation, and rotation about the centre in units that move a point at the mean radius by as much.
-    motions = np.concatenate([normals, np.cross((points - center) / radius, normals)], axis=1)
+    return worst, pair
+
+
+def _slide(views: tuple[int, int], offsets: SurfaceOffsets, seen: Sequence[ColoredView]) -> list[Misplacement]:
+    """Return how far colours lie apart along what the surfaces leave open; empty where they cannot tell."""
+    if len(offsets.points) < _MIN_POINTS:
+        return []
+    motions, center, radius = _motions(offsets)
+    values, axes = np.linalg.eigh(motions.T @ motions)
+    found = slide(seen, center, radius, axes[:, values <= _OPEN * len(motions)])
+    if found is None:
+        return []
+    distance, depth = float(np.linalg.norm(found.motion)), float(np.median(offsets.depth))
+    return [Misplacement(views, distance, found.error, depth, "colours", tuple(found.motion[:3].tolist()))]
+
+
+def _is_mutual(item: Misplacement, found: Sequence[Misplacement]) -> bool:
+    """Whether the second view's colours must be shifted the other way, or nobody asked for that."""
+    back = [other for other in found if other.shift and other.views == item.views[::-1]]
+    return all(np.linalg.norm(np.add(item.shift, other.shift)) <= _MUTUAL * item.distance for other in back)
+
+
+def _motions(offsets: SurfaceOffsets) -> tuple[Array, Array, float]:
+    """Return what a motion does to each distance (point 6), and the centre and mean radius that turns are about.
+
+    Columns: translation, and rotation about the centre in units that move a point at the mean radius by as much.
+    """
+    center = offsets.points.mean(axis=0)
+    arms = offsets.points - center
+    radius = float(np.sqrt((arms**2).sum(axis=1).mean()))
+    return np.concatenate([offsets.normals, np.cross(arms / radius, offsets.normals)], axis=1), center, radius
+
+
+def _misplacement(views: tuple[int, int], offsets: SurfaceOffsets) -> list[Misplacement]:
+    residuals, depth = offsets.distances, offsets.depth
+    if len(residuals) < _MIN_POINTS:
+        return []
+    motions, _, _ = _motions(offsets)
     off = np.abs(residuals - np.median(residuals))
     inside = off <= np.maximum(_INLIER * 1.4826 * float(np.median(off)), _KEPT * depth)
     for _ in range(_NUM_ROUNDS):
         if inside.sum() < _MIN_POINTS:
-            return None
+            return []
         lengths, values, axes = _motion(motions[inside], residuals[inside])
         left = residuals - motions @ (axes @ lengths)
         scatter = 1.4826 * float(np.median(np.abs(left[inside])))
         inside = np.abs(left) <= np.maximum(_INLIER * scatter, _KEPT * depth)
     if not len(values):
-        return None
+        return []
     errors = scatter / np.sqrt(values)
     worst = int(np.argmax(np.abs(lengths) - _SURE * errors))
-    return Misplacement(views, float(np.abs(lengths[worst])), float(errors[worst]), float(np.median(depth)))
+    return [Misplacement(views, float(np.abs(lengths[worst])), float(errors[worst]), float(np.median(depth)))]
 
 
 def _motion(motions: Array, residuals: Array) -> tuple[Array, Array, Array]:
@@ -160,4 +229,5 @@ def surface_offsets(
     alike = (facing @ other.cam_to_world[:3, :3].T * normals).sum(axis=1)
     near = np.abs(other.depth[row, column] - seen[:, 2]) <= _REACH * seen[:, 2]
     kept = in_image & other_surface.is_sure[row, column] & near & (alike > 0.9)  # not the other side of a thin body
-    return SurfaceOffsets(points[kept], normals[kept], distance[kept], depth[kept])
+    pixels = np.stack([rows, columns], axis=1)
+    return SurfaceOffsets(points[kept], normals[kept], distance[kept], depth[kept], pixels[kept])

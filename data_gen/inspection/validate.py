@@ -219,7 +219,7 @@ def _judge_poses(path: Path, found: Sequence[Misplacement]) -> list[Fault]:
     with TrajectoryReader(path) as reader:
         name, other = (reader.view_label(one) for one in (view, sum(pair.views) - view))
     message = (
-        f"the pose of view {name} is off: its surfaces lie {100 * pair.distance:.2g} cm (standard error "
+        f"the pose of view {name} is off: its {pair.evidence} lie {100 * pair.distance:.2g} cm (standard error "
         f"{100 * pair.error:.1g} cm) from those of view {other}, {_percent(pair.distance / pair.depth)} of their "
         f"depth; allowed {_percent(MAX_MISPLACED)}. Calibrate it again (pose, principal point), or trigger the cameras "
         "together"
