@@ -67,7 +67,10 @@ def _plan(config: Mapping[str, Any]) -> None:
             details = {
                 "checkpoint": str(model.path),
                 "checkpoint_sha256": model.sha256,
-                **{name: config[name] for name in ("task", "seed", "preset", "system", "solver", "contact", "max_speed")},
+                **{
+                    name: config[name]
+                    for name in ("task", "seed", "preset", "system", "solver", "contact", "max_speed")
+                },
             }
             write_episode(partial, model.simulator, world, task, episode, details, config["fps"])
     finally:
