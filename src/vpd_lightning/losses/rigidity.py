@@ -22,7 +22,7 @@ class RigidityLoss(AbstractLoss):
     What particles are, and which of them belong together, is not known; only the model's own prediction is looked at.
     """
 
-    # Paper: has no such loss. With it the graph network's bodies grow less over long rollouts; see docs/results.md.
+    # Paper: has no such loss. With it the graph network's bodies grow less over long rollouts; see docs/notes.md.
 
     name = "rigidity"
 
