@@ -126,7 +126,7 @@ def outlier_view(found: Sequence[Misplacement]) -> tuple[int, Misplacement] | No
     """Return the view whose pairs are farthest off, with its worst pair; None where no pair is certain.
 
     A pair counts where it is certain either way around: from its first view's points, and from its second's. Colours
-    count where most comparisons of that view, and two at least, say so.
+    count where two comparisons of that view say so.
     """
     either = {(*item.views, item.evidence): item for item in found}
     certain = [
@@ -134,13 +134,16 @@ def outlier_view(found: Sequence[Misplacement]) -> tuple[int, Misplacement] | No
     ]
     if not certain:
         return None
-    off = {view: [item.distance for item in found if view in item.views] for item in certain for view in item.views}
-    worst = max(off, key=lambda view: float(np.median(off[view])))
-    pair = max((item for item in certain if worst in item.views), key=lambda item: item.distance)
-    alike = [item.excess for item in found if worst in item.views and item.evidence == pair.evidence]
-    if pair.evidence == "colours" and (np.median(alike) <= 0 or sum(excess > 0 for excess in alike) < 2):
+    evidence = certain[0].evidence  # of all: colours are asked where surfaces accuse nobody
+    off = {
+        view: [item for item in found if view in item.views and item.evidence == evidence]
+        for pair in certain
+        for view in pair.views
+    }
+    worst = max(off, key=lambda view: float(np.median([item.distance for item in off[view]])))
+    if evidence == "colours" and sum(item.is_certain for item in off[worst]) < 2:
         return None
-    return worst, pair
+    return worst, max((item for item in certain if worst in item.views), key=lambda item: item.distance)
 
 
 def _slide(views: tuple[int, int], offsets: SurfaceOffsets, seen: Sequence[ColoredView]) -> list[Misplacement]:
