@@ -115,7 +115,7 @@ def write_pack(
     for trajectory in trajectories:
         packed = _packed(trajectory, views, sorted(input_views), base_rgb, base_depth)
         action = _packed_action(trajectory)
-        needed = len(packed) + len(action) + 2 * _OVERHEAD
+        needed = len(packed) + len(action) + (2 if action else 1) * _OVERHEAD
         if size + needed > limit_bytes:
             break
         arrays[f"trajectory_{fitted}"] = np.frombuffer(packed, np.uint8)

@@ -201,6 +201,7 @@ class Training:
             moving_rays=None,
             training_progress=None if self.seconds_in_all is None else lambda: self._share.value,
             num_steps_schedule=_schedule(config["data"]["num_steps_schedule"]),
+            # Packs of before actions do not say load_driven.
             **{name: config["data"][name] for name in CLIPS if name in config["data"] and name != "num_steps_schedule"},
         )
         sampler = StepBatchSampler(
