@@ -33,6 +33,7 @@ from vpd_lightning.files import AtomicPath
 from vpd_lightning.renderer.splat import SplatRenderer
 from vpd_lightning.simulator import Simulator
 from vpd_lightning.testing.free_flight import FAR, NEAR, WORKSPACE_MAX, WORKSPACE_MIN, Flights, FreeFlight
+from vpd_lightning.training.muon import WarmupCosineMuon
 from vpd_lightning.types import Particles
 
 FEATURE_DIM = 16
@@ -57,6 +58,7 @@ class Row:
     message_passing_steps: int = 10
     update_features: bool = True
     dynamics_rate: float = 3e-4
+    muon_rate: float | None = None
     num_abstract_nodes: int = 32
     r_s: float = 0.4
     r_a_s: float = 0.8
@@ -73,6 +75,7 @@ ROWS = {
     "ready renderer, narrow kernels": Row("ready", surface_scale=0.1),
     "ready renderer, wide kernels, features stay": Row("ready", update_features=False),
     "renderer of stills": STAGED,
+    "renderer of stills, Muon": replace(STAGED, muon_rate=1.2e-3),
     "renderer of stills, rate of 1e-3": replace(STAGED, dynamics_rate=1e-3),
     "renderer of stills, features updated": replace(STAGED, update_features=True),
     "renderer of stills, few abstract nodes": Row("stills", update_features=False),
@@ -113,13 +116,16 @@ class Training:
             location_noise=0.0, checkpoint_dynamics=False, pixel_gradient_to_motion=1.0,
         )  # fmt: skip
         pictures = [*self.simulator.encoder.parameters(), *self.simulator.renderer.parameters()]
-        self.optimizer = torch.optim.Adam(
-            [
-                {"params": pictures, "lr": 2e-3},
-                {"params": list(self.simulator.dynamics.parameters()), "lr": row.dynamics_rate},
-            ]
-        )
-        self.rates = [group["lr"] for group in self.optimizer.param_groups]
+        dynamics = WarmupCosineMuon(
+            lr=row.dynamics_rate, muon_lr=row.muon_rate, muon_momentum=0.95, betas=(0.9, 0.999), eps=1e-8,
+            stage_multipliers={}, warmup_steps=50, final_share=0.02,
+        )  # fmt: skip
+        self.optimizers = [
+            torch.optim.Adam(pictures, lr=2e-3),
+            dynamics.optimizer([{"params": list(self.simulator.dynamics.parameters()), "lr": row.dynamics_rate}]),
+        ]
+        self.groups = [group for optimizer in self.optimizers for group in optimizer.param_groups]
+        self.rates = [group["lr"] for group in self.groups]
 
     def learn_to_draw(self, num_updates: int) -> None:
         """Train encoder and renderer on particles that are moved as the balls truly move, or on single frames."""
@@ -147,12 +153,14 @@ class Training:
         self._update(error, warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done))))
 
     def _update(self, error: Tensor, rate: float) -> None:
-        for group, full in zip(self.optimizer.param_groups, self.rates, strict=True):
+        for group, full in zip(self.groups, self.rates, strict=True):
             group["lr"] = rate * full
-        self.optimizer.zero_grad()
+        for optimizer in self.optimizers:
+            optimizer.zero_grad()
         error.backward()
         torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), 1.0)
-        self.optimizer.step()
+        for optimizer in self.optimizers:
+            optimizer.step()
 
     def flights(self, step: int, still: bool = False) -> Flights:
         row = self.row

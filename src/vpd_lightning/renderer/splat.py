@@ -15,6 +15,7 @@ from vpd_lightning.renderer.background import DARKEST, Background, UnseenGround
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.kernel_weights import kernel_weights
 from vpd_lightning.renderer.kernels.ray_search import RaySearch, check_backend
+from vpd_lightning.renderer.observed_light import ObservedScenery, light_then, observed_light
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.renderer.scenery_layer import SceneryLayer, SeenScenery
 from vpd_lightning.renderer.shadows import Shadows
@@ -131,7 +132,7 @@ class SplatRenderer(AbstractRenderer):
         self.scenery: SceneryLayer | None = None
         self.shadows: Shadows | None = None
         self.unseen_ground: UnseenGround | None = None
-        self._kept: tuple[tuple[Any, ...], tuple[SeenScenery, Tensor, Tensor]] | None = None
+        self._kept: tuple[tuple[Any, ...], ObservedScenery] | None = None
         if has_scenery:
             self.scenery = SceneryLayer(
                 num_candidates=num_scenery_candidates,
@@ -262,18 +263,19 @@ class SplatRenderer(AbstractRenderer):
 
         with torch.autocast(rays.origins.device.type, enabled=False):
             clip_rays = Rays(per_clip(rays.origins), per_clip(rays.directions))
-            seen, points, first = self._unlit(scenery, rays, clip_rays)
-            colors = seen.colors
+            unlit = self._unlit(scenery, rays, clip_rays)
+            colors, points = unlit.seen.colors, unlit.points
             if self.shadows is not None:
                 casting = thinned(occluders_of(particles), self.num_occluders)
                 now = self.shadows(points.unflatten(1, (repeats, -1)).flatten(0, 1), casting.positions, casting.mask)
-                lit = colors * per_clip(now) / first
+                now = per_clip(now)
+                lit = colors * now / light_then(unlit.predicted, unlit.corrected, now)
                 colors = lit + (lit.clamp(max=1) - lit).detach()  # what is too bright still learns to be less so
-            parts = seen._replace(colors=colors)
+            parts = unlit.seen._replace(colors=colors)
             return SeenScenery(*(part.unflatten(1, (repeats, -1)).flatten(0, 1) for part in parts))
 
-    def _unlit(self, scenery: Scenery, rays: Rays, clip_rays: Rays) -> tuple[SeenScenery, Tensor, Tensor]:
-        """Return the scenery along the rays as it was observed, where that is, and the light that fell on it then.
+    def _unlit(self, scenery: Scenery, rays: Rays, clip_rays: Rays) -> ObservedScenery:
+        """Return what does not change with what moves.
 
         Without gradients it is kept for the next call: a camera that stands still sees the same at every step.
         """
@@ -282,7 +284,12 @@ class SplatRenderer(AbstractRenderer):
         weights = [weight for part in parts if part is not None for weight in part.parameters()]
         held = [scenery, rays.origins, rays.directions]
         read = [*weights, *held[1:], *(getattr(scenery, item.name) for item in fields(scenery))]
-        key = held, [tensor.dtype for tensor in read], [0 if t.is_inference() else t._version for t in read]
+        key = (
+            held,
+            self.training,
+            [tensor.dtype for tensor in read],
+            [0 if t.is_inference() else t._version for t in read],
+        )
         if self._kept is not None and not torch.is_grad_enabled():
             kept, found = self._kept
             if all(one is other for one, other in zip(held, kept[0], strict=True)) and key[1:] == kept[1:]:
@@ -292,11 +299,13 @@ class SplatRenderer(AbstractRenderer):
             background, ground = self.unseen_ground(scenery, clip_rays, background)
         seen = self.scenery(scenery, clip_rays, background, ground)
         points = clip_rays.origins + seen.distances[..., None] * clip_rays.directions
-        first = torch.ones_like(points)
+        predicted = corrected = torch.ones_like(points)
         if self.shadows is not None:
             casting = thinned(Occluders(scenery.occluders, scenery.occluder_mask), self.num_occluders)
-            first = self.shadows(points, casting.positions, casting.mask)
-        found = seen, points, first
+            predicted = corrected = self.shadows(points, casting.positions, casting.mask)
+            if not self.training:  # training is to see where the prediction is wrong
+                corrected = observed_light(self.shadows, scenery, casting, seen, points, predicted)
+        found = ObservedScenery(seen, points, predicted, corrected)
         self._kept = None if torch.is_grad_enabled() else (key, found)
         return found
 
