@@ -74,9 +74,10 @@ def _counts(text: str) -> list[int]:
 
 def _pack(options: argparse.Namespace) -> None:
     from benchmarks.rented_gpu.packing import write_pack
-    from vpd_lightning.config import compose
+    from vpd_lightning.config import build, compose
     from vpd_lightning.config.pretraining import pretraining_config
     from vpd_lightning.data.background import median_images
+    from vpd_lightning.data.datamodule import VideoDataModule
     from vpd_lightning.data.frames import TrajectoryFrames
     from vpd_lightning.data.manifest import load_manifest
     from vpd_lightning.errors import ConfigError
@@ -96,6 +97,9 @@ def _pack(options: argparse.Namespace) -> None:
     for phase, share in zip(phases[::-1], (1.0 - first_share, first_share), strict=False):
         phase["share"] = share
     views = sorted({*config["data"]["input_views"], *targets})
+    moving_rays = None
+    if config["data"]["moving_ray_fraction"]:
+        moving_rays = build(config["data"], VideoDataModule, "data").clip_dataset(max_steps=1).moving_rays
     fitted, size = write_pack(
         options.out,
         {"phases": phases, "config": config},
@@ -105,6 +109,8 @@ def _pack(options: argparse.Namespace) -> None:
         base=median_images(trajectories, views),
         input_views=config["data"]["input_views"],
         limit_bytes=int(options.limit_mib * 2**20),
+        moving_rays=moving_rays,
+        target_views=targets,
     )
     print(f"{options.out}: {fitted} of {len(files)} training trajectories, {size / 2**20:.2f} MiB")
 
@@ -120,12 +126,12 @@ def _phase(config: dict[str, Any], updates: int, target_views: list[int]) -> dic
 
     if not all(config.get(name) for name in STAGES):
         raise ConfigError("Only systems of encoder, dynamics and renderer can be trained so.\nUse vpd-train.")
-    if config["encoder"].get("background") or config["data"]["moving_ray_fraction"]:
+    if config["encoder"].get("background"):
         raise ConfigError(
-            "Backgrounds and moving rays need the whole training split.\n"
-            "Set encoder.background=null and data.moving_ray_fraction=0, or use vpd-train."
+            "An encoder with a background needs the whole training split.\n"
+            "Set encoder.background=null, or use vpd-train."
         )
-    data = {name: config["data"][name] for name in CLIPS} | {"target_views": target_views}
+    data = {name: config["data"][name] for name in (*CLIPS, "moving_ray_fraction")} | {"target_views": target_views}
     sections = {name: config[name] for name in (*STAGES, "model", "loss", "optimizer", "seed")}
     trainer = {name: config["trainer"].get(name) for name in ("precision", "gradient_clip_val")}
     averaging = (config.get("callbacks") or {}).get("weight_averaging")

@@ -1,8 +1,8 @@
 """Recordings and settings in one small file: what a machine without this project's tools needs for a training.
 
 Cameras stand still, so most pixels of a frame are those of the camera's median image, and what is left compresses well:
-images are stored without loss as their difference from it. Depth is kept for the input cameras alone, in float32, and
-actions as they are recorded.
+images are stored without loss as their difference from it. Depth is kept for the input cameras alone, in float32,
+actions as they are recorded, and where rays are drawn more densely on what moves, which pixels do.
 """
 
 import io
@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
+from vpd_lightning.data.dataset import MovingPixels
 from vpd_lightning.data.driven_motion import DrivenMotion
 from vpd_lightning.data.frame_source import FrameSource
 from vpd_lightning.errors import DataError
@@ -35,6 +36,7 @@ class PackedTrajectory:
     intrinsics: Float[np.ndarray, "view 3 3"]
     cam_to_world: Float[np.ndarray, "view 4 4"]
     action: DrivenMotion | None = None
+    moving_bits: UInt8[np.ndarray, "time byte"] | None = None  # of the pixels of the target views (view, y, x)
     use_cache: bool = True
 
     @property
@@ -74,6 +76,19 @@ class PackedTrajectory:
         return None if self.action is None else self.action.at(times)
 
 
+@dataclass(frozen=True)
+class PackedMovingRays:
+    """``MovingRays`` whose pixels were found when the recordings were packed."""
+
+    fraction: float
+
+    def pixels(self, trajectory: FrameSource, time: int, views: Sequence[int]) -> Int[np.ndarray, " pixel"]:
+        """Return flat indices of the moving pixels of a frame; the views are those that were packed."""
+        assert isinstance(trajectory, PackedTrajectory) and trajectory.moving_bits is not None
+        count = len(views) * trajectory.height * trajectory.width
+        return np.flatnonzero(np.unpackbits(trajectory.moving_bits[time], count=count)).astype(np.int32)
+
+
 def write_pack(
     path: Path,
     settings: Mapping[str, Any],
@@ -84,6 +99,8 @@ def write_pack(
     base: tuple[UInt8[np.ndarray, "view height width 3"], Float32[np.ndarray, "view height width"]],
     input_views: Sequence[int],
     limit_bytes: int,
+    moving_rays: MovingPixels | None = None,
+    target_views: Sequence[int] = (),
 ) -> tuple[int, int]:
     """Write settings and as many trajectories as fit into ``limit_bytes``; return how many fitted and the file's size.
 
@@ -96,6 +113,8 @@ def write_pack(
         base: colours and depth (metres) that these cameras mostly see.
         input_views: cameras whose depth is packed, too.
         limit_bytes: at most so many bytes are written.
+        moving_rays: what finds the moving pixels of the ``target_views``, where rays are drawn on those.
+        target_views: cameras whose pixels the rays are.
 
     Raises:
         DataError: not even one trajectory fits.
@@ -113,14 +132,17 @@ def write_pack(
     size = sum(values.nbytes + _OVERHEAD for values in arrays.values()) + len(json.dumps(settings)) + _OVERHEAD
     fitted = 0
     for trajectory in trajectories:
-        packed = _packed(trajectory, views, sorted(input_views), base_rgb, base_depth)
-        action = _packed_action(trajectory)
-        needed = len(packed) + len(action) + (2 if action else 1) * _OVERHEAD
+        parts = {
+            "trajectory": _packed(trajectory, views, sorted(input_views), base_rgb, base_depth),
+            "action": _packed_action(trajectory),
+            "moving": b"" if moving_rays is None else _packed_moving(trajectory, moving_rays, target_views),
+        }
+        parts = {name: content for name, content in parts.items() if content}
+        needed = sum(len(content) + _OVERHEAD for content in parts.values())
         if size + needed > limit_bytes:
             break
-        arrays[f"trajectory_{fitted}"] = np.frombuffer(packed, np.uint8)
-        if action:
-            arrays[f"action_{fitted}"] = np.frombuffer(action, np.uint8)
+        for name, content in parts.items():
+            arrays[f"{name}_{fitted}"] = np.frombuffer(content, np.uint8)
         size += needed
         fitted += 1
     if not fitted:
@@ -150,18 +172,27 @@ def read_pack(path: Path) -> tuple[dict[str, Any], list[PackedTrajectory]]:
     with np.load(path) as archive:
         shared = {name: archive[name] for name in ("views", "base_rgb", "base_depth", "intrinsics", "cam_to_world")}
         lengths = archive["num_frames"]
-        packed = [archive[f"trajectory_{number}"].tobytes() for number in range(len(settings["names"]))]
-        actions = [
-            _unpacked_action(archive[name].tobytes()) if (name := f"action_{number}") in archive else None
-            for number in range(len(packed))
+        packed = [
+            {
+                part: archive[name].tobytes()
+                for part in ("trajectory", "action", "moving")
+                if (name := f"{part}_{n}") in archive
+            }
+            for n in range(len(settings["names"]))
         ]
     views = [int(view) for view in shared["views"]]
     with_depth = [view for view in views if view in settings["input_views"]]
     found = []
-    for name, length, content, action in zip(settings["names"], lengths, packed, actions, strict=False):
-        rgb, depth = _unpacked(content, int(length), views, with_depth, shared["base_rgb"], shared["base_depth"])
+    for name, length, parts in zip(settings["names"], lengths, packed, strict=False):
+        rgb, depth = _unpacked(
+            parts["trajectory"], int(length), views, with_depth, shared["base_rgb"], shared["base_depth"]
+        )
+        action = _unpacked_action(parts["action"]) if "action" in parts else None
+        moving = None
+        if "moving" in parts:
+            moving = np.frombuffer(lzma.decompress(parts["moving"]), np.uint8).reshape(int(length), -1)
         cameras = shared["intrinsics"], shared["cam_to_world"]
-        found.append(PackedTrajectory(Path(name), rgb, depth, *cameras, action))
+        found.append(PackedTrajectory(Path(name), rgb, depth, *cameras, action, moving))
     return settings, found
 
 
@@ -191,6 +222,14 @@ def _packed_action(trajectory: FrameSource) -> bytes:
     content = io.BytesIO()
     np.savez(content, **driven.as_arrays())
     return lzma.compress(content.getvalue(), preset=_PRESET)
+
+
+def _packed_moving(trajectory: FrameSource, rays: MovingPixels, target_views: Sequence[int]) -> bytes:
+    """Pack a bit for each pixel of each frame of the target views."""
+    moving = np.zeros((trajectory.num_frames, len(target_views) * trajectory.height * trajectory.width), bool)
+    for time, row in enumerate(moving):
+        row[rays.pixels(trajectory, time, target_views)] = True
+    return lzma.compress(np.packbits(moving, axis=1).tobytes(), preset=_PRESET)
 
 
 def _unpacked_action(packed: bytes) -> DrivenMotion:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from benchmarks.rented_gpu.packing import PackedTrajectory
+from benchmarks.rented_gpu.packing import PackedMovingRays, PackedTrajectory
 from benchmarks.rented_gpu.progress import Progress, adam_second_moments, restore_adam, write_progress
 from vpd_lightning.data.collate import collate_clips
 from vpd_lightning.data.dataset import ClipDataset
@@ -195,10 +195,11 @@ class Training:
     def _batches(self) -> DataLoader[VideoBatch]:
         config = self.phases[self.progress.phase]
         updates = config["updates"] if self.seconds_in_all is None else _WITHOUT_END
+        fraction = config["data"].get("moving_ray_fraction", 0.0)
         clips = ClipDataset(
             trajectories=self.trajectories,
             max_steps=updates,
-            moving_rays=None,
+            moving_rays=PackedMovingRays(fraction) if fraction else None,
             training_progress=None if self.seconds_in_all is None else lambda: self._share.value,
             num_steps_schedule=_schedule(config["data"]["num_steps_schedule"]),
             # Packs of before actions do not say load_driven.

@@ -75,9 +75,12 @@ def test_as_many_trajectories_as_fit_are_packed(pack: Path, words: list[str], tm
     assert "Not one trajectory fits" in capsys.readouterr().err
 
 
-def test_clips_and_first_weights_are_those_of_vpd_train(pack: Path, words: list[str]):
+@pytest.mark.parametrize("more", [[], ["data.moving_ray_fraction=0.5", "data.moving_ray_margin=1"]])
+def test_clips_and_first_weights_are_those_of_vpd_train(words: list[str], more: list[str], tmp_path: Path):
     from lightning.pytorch import LightningDataModule
 
+    words, pack = [*words, *more], tmp_path / "pack.npz"
+    assert rented_gpu.main(["pack", "--out", str(pack), "--updates", "2,3", "--limit-mib", "4", *words]) == 0
     config = compose("train", ["run.folder=unused", *words])
     settings, trajectories = read_pack(pack)
     training = Training(settings["phases"][1:], trajectories, torch.device("cpu"), 0, Progress())
@@ -249,8 +252,8 @@ def test_what_the_loop_does_not_offer_is_refused(words: list[str], tmp_path: Pat
 
     assert rented_gpu.main([*out, "1", *words]) == 1
     assert "--updates needs 2 numbers" in capsys.readouterr().err
-    assert rented_gpu.main([*out, "1,1", *words, "data.moving_ray_fraction=0.5"]) == 1
-    assert "moving_ray_fraction=0" in capsys.readouterr().err
+    assert rented_gpu.main([*out, "1,1", *words, "encoder=unet_moving"]) == 1
+    assert "encoder.background=null" in capsys.readouterr().err
 
 
 def test_actions_travel_and_are_trained_on(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,6 +17,17 @@ from vpd_lightning.errors import DataError
 from vpd_lightning.geometry.cameras import rays_through
 from vpd_lightning.randomness import numpy_generator
 from vpd_lightning.types import NUM_CONTEXT_FRAMES, Cameras
+
+
+class MovingPixels(Protocol):
+    """Where a ``fraction`` of a frame's rays is drawn from."""
+
+    @property
+    def fraction(self) -> float: ...
+
+    def pixels(self, trajectory: FrameSource, time: int, views: Sequence[int]) -> Int[np.ndarray, " pixel"]:
+        """Return flat indices (view, y, x) of the moving pixels of a frame in these views."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -37,6 +49,10 @@ class MovingRays:
             raise ValueError(f"moving_ray_fraction must lie in [0, 1], got {self.fraction}")
         if self.margin < 0:
             raise ValueError(f"moving_ray_margin must be a number of pixels from 0 up, got {self.margin}")
+
+    def pixels(self, trajectory: FrameSource, time: int, views: Sequence[int]) -> Int[np.ndarray, " pixel"]:
+        """Return what ``find`` finds in a frame."""
+        return self.find(trajectory.rgb([time], views)[0], trajectory.depth([time], views)[0])
 
     def find(
         self, rgb: UInt8[np.ndarray, "view height width 3"], depth: Float32[np.ndarray, "view height width"]
@@ -82,7 +98,7 @@ class ClipDataset(Dataset[ClipSample]):
         input_views: Sequence[int],
         target_views: Sequence[int],
         start_frames: Sequence[int] | None,
-        moving_rays: MovingRays | None,
+        moving_rays: MovingPixels | None,
         load_future: bool,
         load_driven: bool = False,
         training_progress: Callable[[], float] | None = None,
@@ -176,8 +192,7 @@ class ClipDataset(Dataset[ClipSample]):
         if (index, time) in self._moving_pixels:
             return self._moving_pixels[index, time]
         trajectory = self.trajectories[index]
-        rgb, depth = trajectory.rgb([time], self.target_views)[0], trajectory.depth([time], self.target_views)[0]
-        found = self.moving_rays.find(rgb, depth)
+        found = self.moving_rays.pixels(trajectory, time, self.target_views)
         if trajectory.use_cache:
             self._moving_pixels[index, time] = found
         return found
