@@ -30,6 +30,7 @@ from vpd_lightning.files import AtomicPath
 from vpd_lightning.loading import LoadedModel, load_model
 from vpd_lightning.metrics.psnr import psnr_of_moving_pixels
 from vpd_lightning.metrics.true_images import TrueImages
+from vpd_lightning.runs.evaluation_run import training_of
 from vpd_lightning.types import Driven, Particles
 
 STEPS = (1, 2, 4, 8, 16, 32)
@@ -113,7 +114,10 @@ def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) 
         name: _means(np.concatenate(values), np.array(clip_of)) for name, values in sorted(scores.items())
     }
     parameters = sum(values.numel() for values in model.simulator.parameters())
-    return {**found, "updates": model.step, "parameters": parameters, "starts": list(starts)}
+    training = None if model.checkpoint is None else training_of(model.checkpoint, model.path)
+    return {
+        **found, "updates": model.step, "training": training, "parameters": parameters, "starts": list(starts)
+    }  # fmt: skip
 
 
 def _summary(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]) -> dict[str, Any]:
