@@ -84,7 +84,7 @@ def test_a_checkerboard_keeps_its_tiles() -> None:
     assert (after > 0.1).float().mean() < 0.02
 
 
-def test_light_that_is_predicted_rightly_stays() -> None:
+def test_on_noise_a_right_prediction_changes_little() -> None:
     points = floor(1.0).positions
     albedo = 0.2 + 0.6 * torch.rand(points.shape, generator=torch.Generator().manual_seed(0))
     scenery = floor(albedo, soft_light(points))

@@ -95,10 +95,10 @@ def observed_light(
 def light_then(
     predicted: Float[Tensor, "batch ray 3"], observed: Float[Tensor, "batch ray 3"], now: Float[Tensor, "batch ray 3"]
 ) -> Float[Tensor, "batch ray 3"]:
-    """Return the light by which observed colours are to be divided, where as much light falls ``now`` as predicted.
+    """Return the light that observed colours are divided by, before they are multiplied by that which falls ``now``.
 
-    It is the one predicted for then where now is as dark as then, so that a shadow that stays is drawn as it was seen,
-    and the ``observed`` one where all light has returned.
+    It is the one ``predicted`` for then where now is as dark as then, so that a shadow that stays is drawn as it was
+    seen, the ``observed`` one where all light has returned, and between the two where some has.
     """
     if observed is predicted:
         return predicted
