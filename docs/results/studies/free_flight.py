@@ -134,7 +134,7 @@ class Training:
             _, current = self.encoded(flights)
             true = flights.true_displacements(current.positions)
             states = [replace(current, positions=current.positions + moved) for moved in true.unbind(dim=1)]
-            self._update(self.pixel_error(states, flights), 1.0)
+            self._update(self.pixel_error(states, flights), _rate(step, num_updates))
         for stage in (self.simulator.encoder, self.simulator.renderer):
             stage.requires_grad_(False)
 
@@ -149,8 +149,7 @@ class Training:
                 error = (moved - flights.true_displacements(current.positions)).square().sum(dim=-1).mean()
             else:
                 error = self.pixel_error(states, flights)
-        warm, done = min(1.0, (step + 1) / 50), step / self.num_updates
-        self._update(error, warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done))))
+        self._update(error, _rate(step, self.num_updates))
 
     def _update(self, error: Tensor, rate: float) -> None:
         for group, full in zip(self.groups, self.rates, strict=True):
@@ -229,6 +228,11 @@ class Training:
                     truth = flights.displacements[member, 0, number]
                     cosines.append(torch.cosine_similarity(pull[member][mine].sum(dim=0), truth, dim=0))
         return float(torch.stack(cosines).mean())
+
+
+def _rate(step: int, num_updates: int) -> float:
+    """Return the share of the full learning rate. Without a warm-up a renderer may turn all particles transparent."""
+    return min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / num_updates)))
 
 
 @functools.cache
