@@ -127,6 +127,8 @@ class SplatRenderer(AbstractRenderer):
         if color_features:  # before training, a layer has the mean colour of its particles
             with torch.no_grad():
                 last.weight[:6], last.bias[:6] = 0, 0
+                if not has_scenery:  # and one opacity; a random one may fall to 0 everywhere before colours are right
+                    last.weight[6:], last.bias[6:] = 0, 0
         self.background = Background(frequencies=background_frequencies, hidden_dim=hidden_dim)
         self.facing_softness, self.num_occluders = facing_softness, num_occluders
         self.scenery: SceneryLayer | None = None
