@@ -88,7 +88,7 @@ def test_before_training_a_surface_has_the_colours_of_its_particles():
 
 def test_before_training_all_layers_are_equally_opaque():
     """Random opacities let one training in three turn every particle transparent in its first thirty updates."""
-    layer = torch.sigmoid(torch.tensor(1.0)).double()
+    layer = torch.sigmoid(torch.ones((), dtype=torch.float64))
     possible = torch.stack([0 * layer, layer, 1 - (1 - layer) ** 2])
     opacities = renderer()(particles(), rays(count=200), None).opacities
     assert (opacities[..., None] - possible).abs().min(dim=-1).values.max() < 1e-9
