@@ -231,7 +231,7 @@ class Training:
 
 
 def _rate(step: int, num_updates: int) -> float:
-    """Return the share of the full learning rate. Without a warm-up a renderer may turn all particles transparent."""
+    """Return the share of the full learning rate: a warm-up of 50 updates, then a cosine."""
     return min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / num_updates)))
 
 
