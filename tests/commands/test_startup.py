@@ -9,6 +9,7 @@ import pytest
 
 from tests.evaluation.tossed_box import write_tossed_boxes
 from tests.evaluation.untrained_model import write_untrained
+from vpd_lightning.commands import SPIN_COUNT
 
 ROOT = Path(__file__).resolve().parents[2]
 # What measures, draws, trains and simulates; each takes from 0.2 to 3 seconds.
@@ -64,3 +65,24 @@ else:
     found = loaded(script, f"ckpt={checkpoint if is_there else tmp_path / 'none.ckpt'}")
     assert not found & HEAVY
     assert "torch" in found
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, f"{SPIN_COUNT} None"),
+        ({"GOMP_SPINCOUNT": "7"}, "7 None"),
+        ({"OMP_WAIT_POLICY": "active"}, "None active"),
+    ],
+)
+def test_threads_that_wait_give_up_their_core_soon(given: dict[str, str], expected: str) -> None:
+    """It is decided before PyTorch is imported, which reads it once; who has decided otherwise is obeyed."""
+    script = """
+import os, sys
+import vpd_lightning.commands
+print("torch" in sys.modules, os.environ.get("GOMP_SPINCOUNT"), os.environ.get("OMP_WAIT_POLICY"))
+"""
+    kept = {key: value for key, value in os.environ.items() if key not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    environment = {**kept, **given, "PYTHONPATH": str(ROOT / "src")}
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, check=True)
+    assert result.stdout.split() == ["False", *expected.split()]

@@ -7,6 +7,10 @@ given the true motion (``true``), that of another clip, carried to where the pus
 degrees, by horizon; beside them what needs no model (a constant displacement means nothing where bodies are pushed
 any way). ``psnr_moving`` is of pictures of the first camera (dB, over moving pixels), beside the last input frame
 (``copy``) and the mean of the training pictures. Intervals: 2,000 resamples of trajectories.
+
+``--ratios NAME=A,B/C,D`` divides the mean error of A and B (given the true action) by that of C and D (given none):
+the same bodies in both, all four of them in the file. DATA holds the split that is measured and, as ``train``, the
+recordings of which the mean picture is.
 """
 
 import json
@@ -109,7 +113,8 @@ def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) 
                 for name, colors in shown_as.items():
                     scores.setdefault(name, []).append(psnr_of_moving_pixels(colors, seen)["psnr_moving"].mT.numpy())
                 trajectory += [number] * int(keep.sum())
-    found = _summary({name: np.concatenate(values) for name, values in rows.items()}, np.array(trajectory))
+    bodies = {name: np.concatenate(values) for name, values in rows.items()}
+    found = {**_summary(bodies, np.array(trajectory)), "sums": _sums(bodies, np.array(trajectory))}
     found["psnr_moving"] = {
         name: _means(np.concatenate(values), np.array(clip_of)) for name, values in sorted(scores.items())
     }
@@ -138,6 +143,35 @@ def _summary(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]
     return found
 
 
+def _sums(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]) -> dict[str, Any]:
+    """Return the sum of the centre's errors (cm) of each trajectory's bodies, by kind of action and step."""
+    numbers = np.unique(trajectory)
+    return {
+        name.split("/")[0]: {
+            str(step): [float(100 * values[trajectory == n, step - 1].sum()) for n in numbers] for step in STEPS
+        }
+        for name, values in sorted(rows.items())
+        if name.endswith("/centroid_error")
+    }
+
+
+def ratio(result: dict[str, Any], words: str) -> dict[str, Any]:
+    """Return error with the action divided by error without, by step: [ratio, low, high]; trajectories resampled.
+
+    Several models of a kind, trained with other seeds, are measured as one: their errors are added before division.
+    """
+    above, below = (names.split(",") for names in words.split("/"))
+    draw = np.random.default_rng(0)
+    found: dict[str, Any] = {"with": above, "without": below}
+    for step in map(str, STEPS):
+        upper = np.sum([result[name]["sums"]["true"][step] for name in above], axis=0) / len(above)
+        lower = np.sum([result[name]["sums"]["none"][step] for name in below], axis=0) / len(below)
+        chosen = draw.integers(len(upper), size=(_NUM_RESAMPLES, len(upper)))
+        low, high = np.percentile(upper[chosen].sum(axis=1) / lower[chosen].sum(axis=1), [2.5, 97.5])
+        found[step] = [float(upper.sum() / lower.sum()), float(low), float(high)]
+    return found
+
+
 def _means(values: NDArray[np.float64], trajectory: NDArray[np.int64]) -> dict[str, list[float]]:
     """Return mean and 95 % interval by step: [mean, low, high]; resampled by trajectory."""
     draw = np.random.default_rng(0)
@@ -154,7 +188,9 @@ def _means(values: NDArray[np.float64], trajectory: NDArray[np.int64]) -> dict[s
 
 def main() -> None:
     """Measure the models and print a table of each."""
-    options = parser_of(__doc__, "+").parse_args()
+    parser = parser_of(__doc__, "*")
+    parser.add_argument("--ratios", nargs="*", default=[], help="NAME=WITH,.../WITHOUT,...")
+    options = parser.parse_args()
     torch.set_num_threads(1)
     result = json.loads(options.out.read_text()) if options.out.is_file() else {}
     for words in options.models:
@@ -165,6 +201,12 @@ def main() -> None:
         with AtomicPath(options.out) as path:
             path.write_text(json.dumps(result, indent=1) + "\n")
         print_table(name, result[name])
+    for words in options.ratios:
+        name, parts = words.split("=", 1)
+        result[name] = ratio(result, parts)
+        with AtomicPath(options.out) as path:
+            path.write_text(json.dumps(result, indent=1) + "\n")
+        print(name, " ".join(f"{step}: {result[name][str(step)][0]:.2f}" for step in STEPS))
 
 
 def print_table(name: str, found: dict[str, Any]) -> None:
