@@ -1,21 +1,22 @@
 """What the action is worth: motion of pushed bodies with the true action, another recording's, none, and without any.
 
-``python -m docs.results.studies.actions OUT.json DATA NAME=CKPT ... [--split test --starts 0 6 12]`` measures every
-checkpoint on bodies whose true centre moves by more than ``MOVED`` within 16 steps. A model that takes actions is
-given the true motion (``true``), that of another clip, carried to where the pusher is (``shuffled``), and none
-(``still``: the pusher stays). Errors are those of ``vpd-eval``: of the centre in centimetres, of the orientation in
-degrees, by horizon; beside them what needs no model (a constant displacement means nothing where bodies are pushed
-any way). ``psnr_moving`` is of pictures of the first camera (dB, over moving pixels), beside the last input frame
-(``copy``) and the mean of the training pictures. Intervals: 2,000 resamples of trajectories.
+``python -m docs.results.studies.actions OUT.json DATA NAME=CKPT[,CKPT...] ... [--split test --starts 0 6 12]``
+measures every system, trained once or with several seeds (whose errors are averaged body by body), on bodies whose
+true centre moves by more than ``MOVED`` within 16 steps. A model that takes actions is given the true motion
+(``true``), that of another clip, carried to where the pusher is (``shuffled``), and none (``still``: the pusher
+stays). Errors are those of ``vpd-eval``: of the centre in centimetres, of the orientation in degrees, by horizon;
+beside them what needs no model (a constant displacement means nothing where bodies are pushed any way).
+``psnr_moving`` is of pictures of the first camera (dB, over moving pixels), beside the last input frame (``copy``) and
+the mean of the training pictures. Intervals: 2,000 resamples of trajectories.
 
-``--ratios NAME=A,B/C,D`` divides the mean error of A and B (given the true action) by that of C and D (given none):
-the same bodies in both, all four of them in the file. DATA holds the split that is measured and, as ``train``, the
+``--ratios NAME=WITH/WITHOUT`` divides the mean error of one system of the file, given the true action, by that of
+another one, given none: the same bodies in both. DATA holds the split that is measured and, as ``train``, the
 recordings of which the mean picture is.
 """
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,17 @@ def true_pictures(model: LoadedModel, clip: Clip) -> TrueImages:
     return TrueImages(colors[:, [CAMERA]], moving[:, [CAMERA]], protocol.min_moving_pixels)
 
 
-def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one model: by body (rows) and by clip (scores), each with the number of its trajectory."""
+
+    bodies: dict[str, NDArray[np.float64]]
+    trajectory: NDArray[np.int64]
+    scores: dict[str, NDArray[np.float64]]
+    clip_of: NDArray[np.int64]
+
+
+def errors(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) -> Errors:
     """Return the errors of one model with each kind of action."""
     margin = model.config["protocol"]["body_margin"]
     mean = training_mean(sorted((data / "train").glob("*.h5")))[None, [CAMERA]]
@@ -113,16 +124,32 @@ def measured(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) 
                 for name, colors in shown_as.items():
                     scores.setdefault(name, []).append(psnr_of_moving_pixels(colors, seen)["psnr_moving"].mT.numpy())
                 trajectory += [number] * int(keep.sum())
-    bodies = {name: np.concatenate(values) for name, values in rows.items()}
-    found = {**_summary(bodies, np.array(trajectory)), "sums": _sums(bodies, np.array(trajectory))}
+    return Errors(
+        {name: np.concatenate(values) for name, values in rows.items()}, np.array(trajectory),
+        {name: np.concatenate(values) for name, values in scores.items()}, np.array(clip_of),
+    )  # fmt: skip
+
+
+def measured(models: Sequence[LoadedModel], data: Path, split: str, starts: Sequence[int]) -> dict[str, Any]:
+    """Return the errors of one system, averaged over its models (one for each seed)."""
+    each = [errors(model, data, split, starts) for model in models]
+    first = each[0]
+    bodies = {name: np.mean([one.bodies[name] for one in each], axis=0) for name in first.bodies}
+    found = {**_summary(bodies, first.trajectory), "sums": _sums(bodies, first.trajectory)}
     found["psnr_moving"] = {
-        name: _means(np.concatenate(values), np.array(clip_of)) for name, values in sorted(scores.items())
+        name: _means(np.mean([one.scores[name] for one in each], axis=0), first.clip_of)
+        for name in sorted(first.scores)
     }
-    parameters = sum(values.numel() for values in model.simulator.parameters())
-    training = None if model.checkpoint is None else training_of(model.checkpoint, model.path)
-    return {
-        **found, "updates": model.step, "training": training, "parameters": parameters, "starts": list(starts)
-    }  # fmt: skip
+    found["seeds"] = [
+        {
+            "centroid_error": _centres(_summary(one.bodies, one.trajectory)),
+            "updates": model.step,
+            "training": None if model.checkpoint is None else training_of(model.checkpoint, model.path),
+        }
+        for model, one in zip(models, each, strict=True)
+    ]
+    parameters = sum(values.numel() for values in models[0].simulator.parameters())
+    return {**found, "parameters": parameters, "starts": list(starts)}
 
 
 def _summary(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]) -> dict[str, Any]:
@@ -143,6 +170,12 @@ def _summary(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]
     return found
 
 
+def _centres(found: dict[str, Any]) -> dict[str, Any]:
+    """Return the centre's error of each kind of action."""
+    parts = {kind: part for kind, part in found.items() if isinstance(part, dict)}
+    return {kind: part["centroid_error"] for kind, part in parts.items() if "centroid_error" in part}
+
+
 def _sums(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]) -> dict[str, Any]:
     """Return the sum of the centre's errors (cm) of each trajectory's bodies, by kind of action and step."""
     numbers = np.unique(trajectory)
@@ -155,17 +188,12 @@ def _sums(rows: dict[str, NDArray[np.float64]], trajectory: NDArray[np.int64]) -
     }
 
 
-def ratio(result: dict[str, Any], words: str) -> dict[str, Any]:
-    """Return error with the action divided by error without, by step: [ratio, low, high]; trajectories resampled.
-
-    Several models of a kind, trained with other seeds, are measured as one: their errors are added before division.
-    """
-    above, below = (names.split(",") for names in words.split("/"))
+def ratio(above: dict[str, Any], below: dict[str, Any]) -> dict[str, list[float]]:
+    """Return error with the action divided by error without, by step: [ratio, low, high]; trajectories resampled."""
     draw = np.random.default_rng(0)
-    found: dict[str, Any] = {"with": above, "without": below}
+    found = {}
     for step in map(str, STEPS):
-        upper = np.sum([result[name]["sums"]["true"][step] for name in above], axis=0) / len(above)
-        lower = np.sum([result[name]["sums"]["none"][step] for name in below], axis=0) / len(below)
+        upper, lower = np.array(above["sums"]["true"][step]), np.array(below["sums"]["none"][step])
         chosen = draw.integers(len(upper), size=(_NUM_RESAMPLES, len(upper)))
         low, high = np.percentile(upper[chosen].sum(axis=1) / lower[chosen].sum(axis=1), [2.5, 97.5])
         found[step] = [float(upper.sum() / lower.sum()), float(low), float(high)]
@@ -189,35 +217,34 @@ def _means(values: NDArray[np.float64], trajectory: NDArray[np.int64]) -> dict[s
 def main() -> None:
     """Measure the models and print a table of each."""
     parser = parser_of(__doc__, "*")
-    parser.add_argument("--ratios", nargs="*", default=[], help="NAME=WITH,.../WITHOUT,...")
+    parser.add_argument("--ratios", nargs="*", default=[], help="NAME=WITH/WITHOUT")
     options = parser.parse_args()
     torch.set_num_threads(1)
     result = json.loads(options.out.read_text()) if options.out.is_file() else {}
     for words in options.models:
-        name, ckpt = words.split("=", 1)
-        model = load_model(ckpt)
-        changes = change_dynamics(model, options.dynamics)
-        result[name] = {**measured(model, options.data, options.split, options.starts), "dynamics": changes}
-        with AtomicPath(options.out) as path:
-            path.write_text(json.dumps(result, indent=1) + "\n")
+        name, paths = words.split("=", 1)
+        models = [load_model(path) for path in paths.split(",")]
+        changes = [change_dynamics(model, options.dynamics) for model in models][0]
+        result[name] = {**measured(models, options.data, options.split, options.starts), "dynamics": changes}
+        _write(options.out, result)
         print_table(name, result[name])
     for words in options.ratios:
         name, parts = words.split("=", 1)
-        result[name] = ratio(result, parts)
-        with AtomicPath(options.out) as path:
-            path.write_text(json.dumps(result, indent=1) + "\n")
+        above, below = parts.split("/", 1)
+        result[name] = ratio(result[above], result[below])
+        _write(options.out, result)
         print(name, " ".join(f"{step}: {result[name][str(step)][0]:.2f}" for step in STEPS))
+
+
+def _write(out: Path, result: dict[str, Any]) -> None:
+    with AtomicPath(out) as path:
+        path.write_text(json.dumps(result, indent=1) + "\n")
 
 
 def print_table(name: str, found: dict[str, Any]) -> None:
     """Print the centre's error of each kind of action."""
     print(f"{name}: {found['bodies']} bodies of {found['trajectories']} trajectories; cm after {STEPS} steps")
-    parts = {
-        kind: part["centroid_error"]
-        for kind, part in found.items()
-        if isinstance(part, dict) and "centroid_error" in part
-    }
-    for kind, row in {**parts, **found["references"]}.items():
+    for kind, row in {**_centres(found), **found["references"]}.items():
         print(f"  {kind:14}", " ".join(f"{row[str(step)][0]:6.2f}" for step in STEPS))
     print("  moving PSNR of its pictures, dB")
     for kind, row in found["psnr_moving"].items():
