@@ -41,7 +41,10 @@ def test_seeds_are_averaged_body_by_body(monkeypatch: pytest.MonkeyPatch) -> Non
     for name, values in {"a": [0.01, 0.03], "b": [0.05, 0.03]}.items():
         bodies = np.repeat(np.array(values)[:, None], max(STEPS), axis=1)
         scores = np.full((2, len(STEPS)), 10.0 if name == "a" else 20.0)
-        made[name] = Errors({"true/centroid_error": bodies}, np.array([0, 1]), {"true": scores}, np.array([0, 1]))
+        made[name] = Errors(
+            {"true/centroid_error": bodies}, np.array([0, 1]), np.array([True, False]), {"true": scores},
+            np.array([0, 1]),
+        )  # fmt: skip
     monkeypatch.setattr(actions, "errors", lambda model, *_: made[model.name])
     models = [
         SimpleNamespace(name=name, simulator=torch.nn.Linear(2, 3), step=7, checkpoint=None, path=Path())
@@ -50,6 +53,7 @@ def test_seeds_are_averaged_body_by_body(monkeypatch: pytest.MonkeyPatch) -> Non
     found = actions.measured(models, Path(), "test", [0])  # type: ignore[arg-type]
     assert found["true"]["centroid_error"]["8"] == pytest.approx([3.0, 3.0, 3.0])
     assert found["sums"]["true"]["8"] == pytest.approx([3.0, 3.0])
+    assert found["stay"]["sums"]["true"]["8"] == pytest.approx([3.0]), "the other one falls"
     assert found["psnr_moving"]["true"]["16"][0] == pytest.approx(15.0)
     assert [seed["centroid_error"]["true"]["8"][0] for seed in found["seeds"]] == pytest.approx([2.0, 4.0])
     assert found["parameters"] == 9

@@ -2,7 +2,8 @@
 
 ``python -m docs.results.studies.actions OUT.json DATA NAME=CKPT[,CKPT...] ... [--split test --starts 0 6 12]``
 measures every system, trained once or with several seeds (whose errors are averaged body by body), on bodies whose
-true centre moves by more than ``MOVED`` within 16 steps. A model that takes actions is given the true motion
+true centre moves by more than ``MOVED`` within 16 steps, and apart (``stay``) on those of them that do not fall by
+``FALLEN`` meanwhile. A model that takes actions is given the true motion
 (``true``), that of another clip, carried to where the pusher is (``shuffled``), and none (``still``: the pusher
 stays). Errors are those of ``vpd-eval``: of the centre in centimetres, of the orientation in degrees, by horizon;
 beside them what needs no model (a constant displacement means nothing where bodies are pushed any way).
@@ -40,6 +41,7 @@ from vpd_lightning.types import Driven, Particles
 
 STEPS = (1, 2, 4, 8, 16, 32)
 MOVED = 0.01  # metres
+FALLEN = 0.05  # metres
 TOUCHED_WITHIN = 16  # steps
 REFERENCES = {"nothing moves": "copy", "true velocity": "velocity"}
 CAMERA = 0
@@ -89,6 +91,7 @@ class Errors:
 
     bodies: dict[str, NDArray[np.float64]]
     trajectory: NDArray[np.int64]
+    stays: NDArray[np.bool_]
     scores: dict[str, NDArray[np.float64]]
     clip_of: NDArray[np.int64]
 
@@ -102,13 +105,15 @@ def errors(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) ->
     files = sorted((data / split).glob("*.h5"))
     rows: dict[str, list[NDArray[np.float64]]] = {}
     trajectory: list[int] = []
+    stays: list[NDArray[np.bool_]] = []
     with torch.no_grad():
         for number, path in enumerate(files):
             for start in starts:
                 clip = read_clip(path, number, start, max(STEPS))
                 other = read_clip(files[(number + 1) % len(files)], number, start, max(STEPS))
-                poses = clip.poses(max(STEPS))[..., :3]
-                touched = (poses[: TOUCHED_WITHIN + 1] - poses[:1]).norm(dim=-1).amax(dim=0) > MOVED
+                moved = clip.poses(TOUCHED_WITHIN)[..., :3]
+                moved = moved - moved[:1]
+                touched = moved.norm(dim=-1).amax(dim=0) > MOVED
                 if not bool(touched.any()):
                     continue
                 scene = encode_clip(model.simulator, clip, model.input_views)
@@ -124,8 +129,9 @@ def errors(model: LoadedModel, data: Path, split: str, starts: Sequence[int]) ->
                 for name, colors in shown_as.items():
                     scores.setdefault(name, []).append(psnr_of_moving_pixels(colors, seen)["psnr_moving"].mT.numpy())
                 trajectory += [number] * int(keep.sum())
+                stays.append((moved[..., 2].amin(dim=0) > -FALLEN)[: len(keep)][keep].numpy())
     return Errors(
-        {name: np.concatenate(values) for name, values in rows.items()}, np.array(trajectory),
+        {name: np.concatenate(values) for name, values in rows.items()}, np.array(trajectory), np.concatenate(stays),
         {name: np.concatenate(values) for name, values in scores.items()}, np.array(clip_of),
     )  # fmt: skip
 
@@ -135,7 +141,11 @@ def measured(models: Sequence[LoadedModel], data: Path, split: str, starts: Sequ
     each = [errors(model, data, split, starts) for model in models]
     first = each[0]
     bodies = {name: np.mean([one.bodies[name] for one in each], axis=0) for name in first.bodies}
+    staying = {name: values[first.stays] for name, values in bodies.items()}
     found = {**_summary(bodies, first.trajectory), "sums": _sums(bodies, first.trajectory)}
+    found["stay"] = {
+        **_summary(staying, first.trajectory[first.stays]), "sums": _sums(staying, first.trajectory[first.stays])
+    }  # fmt: skip
     found["psnr_moving"] = {
         name: _means(np.mean([one.scores[name] for one in each], axis=0), first.clip_of)
         for name in sorted(first.scores)
@@ -231,9 +241,11 @@ def main() -> None:
     for words in options.ratios:
         name, parts = words.split("=", 1)
         above, below = parts.split("/", 1)
-        result[name] = ratio(result[above], result[below])
+        both = result[above], result[below]
+        result[name] = {"all": ratio(*both), "stay": ratio(*(one["stay"] for one in both))}
         _write(options.out, result)
-        print(name, " ".join(f"{step}: {result[name][str(step)][0]:.2f}" for step in STEPS))
+        for bodies, found in result[name].items():
+            print(name, bodies, " ".join(f"{step}: {found[str(step)][0]:.2f}" for step in STEPS))
 
 
 def _write(out: Path, result: dict[str, Any]) -> None:
