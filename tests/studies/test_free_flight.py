@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
+from matplotlib import pyplot
 
-from docs.results.studies import free_flight
+from docs.results.studies import free_flight, free_flight_figure
 from vpd_lightning.testing.free_flight import FreeFlight
 
 
@@ -38,3 +39,23 @@ def test_rows_are_trained_once_and_measured(tmp_path: Path, monkeypatch: pytest.
         assert references["constant_velocity"] < references["nothing_moves"]
         assert last["step_1_cm"]["centre"] != first["step_1_cm"]["centre"]
         assert ("psnr_truly_moved" in last) == (name != "targets")
+
+
+def test_each_row_has_a_bar_with_its_last_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows are sorted by link; bars are of the last measurement, not of the first."""
+    found = {"centre": 3.0, "nothing_moves": 4.5, "constant_velocity": 0.4}
+    rows = {
+        name: {
+            "row": {"link": link},
+            "curve": {"0": {f"step_{step}_cm": {**found, "centre": 9.0} for step in free_flight_figure.STEPS},
+                      "600": {f"step_{step}_cm": {**found, "centre": error} for step in free_flight_figure.STEPS}},
+        }
+        for name, link, error in (("all", "own", 4.8), ("alone", "targets", 2.2))
+    }  # fmt: skip
+    drawn = []
+    monkeypatch.setattr(pyplot, "close", drawn.append)
+    free_flight_figure.draw({**rows, "gradients": {}}, tmp_path / "figure.png")
+    axis = drawn[0].axes[0]
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["alone", "all"]
+    assert [bar.get_width() for bar in axis.patches] == [2.2, 4.8]
+    assert (tmp_path / "figure.png").stat().st_size > 0
