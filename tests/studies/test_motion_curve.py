@@ -1,4 +1,4 @@
-"""Checkpoints of trainings measured one after the other, and the law through them."""
+"""Checkpoints of trainings measured one after the other."""
 
 import json
 from pathlib import Path
@@ -8,15 +8,6 @@ import pytest
 
 from docs.results.studies import motion_curve
 from tests.evaluation.untrained_model import write_untrained
-
-
-def test_the_law_that_made_the_points_is_found() -> None:
-    updates = [250, 500, 1000, 2000, 8000]
-    law = motion_curve.fitted_law(updates, [0.5 + 0.8 * (n / 1000) ** -0.7 for n in updates])
-    assert law is not None
-    assert [law[name] for name in ("floor", "scale", "exponent")] == pytest.approx([0.5, 0.8, 0.7], rel=1e-3)
-    assert law["at_400000_updates"] == pytest.approx(0.5 + 0.8 * 400**-0.7, rel=1e-3)
-    assert motion_curve.fitted_law(updates[:3], [3.0, 2.0, 1.0]) is None
 
 
 def test_slope_and_correlation_are_those_of_each_body_beside_the_mean() -> None:

@@ -1,4 +1,4 @@
-"""How VPD's motion improves with training: checkpoints of one training after another, and a fitted law.
+"""How VPD's motion improves with training: checkpoints of one training after another.
 
 ``python -m docs.results.studies.motion_curve OUT.json DATA NAME=CKPT,CKPT,... ...`` measures every checkpoint on the
 validation split: mean centroid error (centimetres) after each of ``STEPS`` steps beside the references of the same
@@ -6,9 +6,7 @@ clips, correlation and slope of the predicted on the true displacement of bodies
 mean over all bodies, which is what tells whether each body's own motion is seen), and the size of bodies. Updates and
 seconds of the training are those in the checkpoint. What OUT.json holds already is not measured again.
 
-With at least four checkpoints, ``law`` is the power law error = floor + scale * (updates / 1000) ** -exponent after one
-step, fitted by least squares with all three at least 0. It says nothing about a rate that falls to its end: compare
-trainings at their ends, and points within one only where the rate was constant.
+``motion_law.py`` fits laws to these points and draws them.
 """
 
 import argparse
@@ -20,7 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import curve_fit
 
 from docs.results.studies.vpd_motion import REFERENCES
 from vpd_lightning.data.clip import read_clip
@@ -32,7 +29,6 @@ from vpd_lightning.files import AtomicPath
 from vpd_lightning.loading import LoadedModel, load_model
 
 STEPS = (1, 2, 4, 8, 16, 32)
-MIN_POINTS = 4
 
 
 def measured(model: LoadedModel, data: Path, split: str, start_frames: Sequence[int]) -> dict[str, Any]:
@@ -89,30 +85,8 @@ def first_step(moved: NDArray[np.float64]) -> dict[str, float]:
     }
 
 
-def fitted_law(updates: Sequence[float], errors: Sequence[float]) -> dict[str, float] | None:
-    """Return floor, scale and exponent of the law, and its error after 400,000 updates; None for too few points."""
-    if len(updates) < MIN_POINTS:
-        return None
-
-    def law(thousands: NDArray[np.float64], floor: float, scale: float, exponent: float) -> NDArray[np.float64]:
-        return floor + scale * thousands**-exponent
-
-    thousands, found = np.asarray(updates) / 1000, np.asarray(errors)
-    (floor, scale, exponent), _ = curve_fit(
-        law, thousands, found, p0=(found.min() / 2, found.min() / 2, 0.5), bounds=(0, np.inf), max_nfev=20_000
-    )
-    residual = found - law(thousands, floor, scale, exponent)
-    return {
-        "floor": float(floor),
-        "scale": float(scale),
-        "exponent": float(exponent),
-        "rms_residual": float(np.sqrt(np.square(residual).mean())),
-        "at_400000_updates": float(law(np.array([400.0]), floor, scale, exponent)[0]),
-    }
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure what is not measured yet, one checkpoint after the other, and fit the laws."""
+    """Measure what is not measured yet, one checkpoint after the other."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("data", type=Path)
@@ -127,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"{options.out} was measured with {found['setting']}; name another file")
     for word in options.trainings:
         name, _, paths = word.partition("=")
-        training = found["trainings"].setdefault(name, {"points": {}, "law": None})
+        training = found["trainings"].setdefault(name, {"points": {}})
         for path in paths.split(","):
             model = load_model(path)
             if model.sha256 in training["points"]:
@@ -135,6 +109,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             time = ((model.checkpoint or {}).get("callbacks") or {}).get("TimeBudget") or {}
             point = {
                 "updates": model.step,
+                "clips_per_update": model.config["data"]["batch_size"],
+                "parameters_of_dynamics": sum(weight.numel() for weight in model.simulator.dynamics.parameters()),
                 "seconds": time.get("seconds"),
                 "seconds_before": time.get("seconds_before"),
             }
@@ -142,10 +118,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             training["points"][model.sha256] = point
             print(name, point, flush=True)
             _write(options.out, found)
-        points = sorted(training["points"].values(), key=lambda point: point["updates"])
-        errors = [point["centroid_error_cm"]["model"]["1"] for point in points]
-        training["law"] = fitted_law([point["updates"] for point in points], errors)
-        _write(options.out, found)
     return 0
 
 
