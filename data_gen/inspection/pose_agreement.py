@@ -6,13 +6,14 @@ far they are moved is compared with how surely it is known. What the surfaces do
 table, is told by colours (``color_agreement``); what neither determines counts as right.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_gen.inspection.camera_conventions import STORED, CameraConvention
 from data_gen.inspection.color_agreement import ColoredView, slide
 from data_gen.inspection.posed_depth import Array, PosedDepth, choose_pairs, rays, read_posed_depth
 from data_gen.inspection.smooth_surface import SmoothSurface, smooth_surface
@@ -29,6 +30,9 @@ _REACH = 0.1  # of the depth: farther apart are other surfaces
 _NUM_ROUNDS, _INLIER = 4, 3.0  # fits, and standard deviations within which points count
 _KEPT = 0.015  # of the depth: so far off points always count, or a bare floor would outvote all that stands on it
 _OPEN = 0.02  # share of the points that face a motion below which it is asked of colours
+_CLEARLY_BETTER = 0.5  # share of the distances that a convention leaves which explains them, median over the pairs
+_ROUNDING = 1e-4  # of the depth: what is nearer is together
+_TIED = 0.8  # share of the worst view's median distance from which another one is as suspect
 _MUTUAL = 0.5  # share of a slide by which those of either view to the other differ at most
 _MOST_COLORED = 5000  # points of a moment
 _TELLING = 20.0  # points that face a motion, or as many more that it passes at an angle; fewer say nothing of it
@@ -85,8 +89,10 @@ class SurfaceOffsets(NamedTuple):
         )
 
 
-def misplacements(reader: TrajectoryReader, max_pairs: int) -> list[Misplacement]:
-    """Compare views of one moment, pair by pair; pairs that share too few surfaces are left out.
+def misplacements(
+    reader: TrajectoryReader, max_pairs: int, convention: CameraConvention = STORED
+) -> list[Misplacement]:
+    """Compare views of one moment, pair by pair, under a convention; pairs that share too few surfaces are left out.
 
     Cameras that stand still are compared at several moments together: what moves shows its sides at different places.
     """
@@ -96,6 +102,8 @@ def misplacements(reader: TrajectoryReader, max_pairs: int) -> list[Misplacement
         times = np.unique(np.linspace(0, reader.num_frames - 1, _MAX_TIMES).round().astype(int)).tolist()
     pairs = [(one[1], two[1]) for one, two in choose_pairs(reader, max_pairs, [middle]) if one[0] == two[0]]
     images = read_posed_depth(reader, [(time, view) for time in times for pair in pairs for view in pair])
+    if convention != STORED:
+        images = {key: convention.read(image) for key, image in images.items()}
     surfaces = {key: smooth_surface(image) for key, image in images.items()}
     found = []
     for first, second in pairs:
@@ -122,9 +130,10 @@ def misplacements(reader: TrajectoryReader, max_pairs: int) -> list[Misplacement
     return [item for item in found if not item.shift or _is_mutual(item, found)]
 
 
-def outlier_view(found: Sequence[Misplacement]) -> tuple[int, Misplacement] | None:
+def outlier_views(found: Sequence[Misplacement]) -> tuple[tuple[int, ...], Misplacement] | None:
     """Return the view whose pairs are farthest off, with its worst pair; None where no pair is certain.
 
+    Both views of that pair where nothing tells which of them it is: two cameras alone, or no third that acquits one.
     A pair counts where it is certain either way around: from its first view's points, and from its second's. Colours
     count where two comparisons of that view say so.
     """
@@ -140,10 +149,47 @@ def outlier_view(found: Sequence[Misplacement]) -> tuple[int, Misplacement] | No
         for pair in certain
         for view in pair.views
     }
-    worst = max(off, key=lambda view: float(np.median([item.distance for item in off[view]])))
+    medians = {view: float(np.median([item.distance for item in items])) for view, items in off.items()}
+    # One that stands wrong is apart from all that see the same; each of those may have been compared with it alone.
+    partners = {view: len({frozenset(item.views) for item in certain if view in item.views}) for view in off}
+    far = [view for view in off if medians[view] >= _TIED * max(medians.values())]
+    worst = max(far, key=lambda view: (partners[view], medians[view]))
     if evidence == "colours" and sum(item.is_certain for item in off[worst]) < 2:
         return None
-    return worst, max((item for item in certain if worst in item.views), key=lambda item: item.distance)
+    pair = max((item for item in certain if worst in item.views), key=lambda item: item.distance)
+    other = sum(pair.views) - worst
+    is_open = other in far and partners[other] == partners[worst]
+    return (tuple(sorted((worst, other))) if is_open else (worst,)), pair
+
+
+def explanation(
+    reader: TrajectoryReader, max_pairs: int, conventions: Iterable[CameraConvention], stored: Sequence[Misplacement]
+) -> CameraConvention | None:
+    """Return the convention under which cameras that surely stand apart stand together; None where there is none.
+
+    What noise hides from single points, all of them together tell. A single camera that stands wrong is explained by no
+    convention: its own pairs come nearer, and the others fall apart.
+
+    Args:
+        reader: of the recording.
+        max_pairs: of views.
+        conventions: that single points cannot tell from the stored one.
+        stored: what ``misplacements`` found in the recording as it is.
+    """
+    before = {(*item.views, item.evidence): item.distance for item in stored}
+    excess = [item.distance - _SURE * item.error - _ROUNDING * item.depth for item in stored]
+    if not excess or np.median(excess) <= 0:
+        return None
+    left: dict[CameraConvention, float] = {}
+    for convention in conventions:
+        found = misplacements(reader, max_pairs, convention)
+        shares = [
+            item.distance / before[key] for item in found if before.get(key := (*item.views, item.evidence), 0.0) > 0
+        ]
+        if shares and outlier_views(found) is None:
+            left[convention] = float(np.median(shares))
+    best = min(left, key=left.__getitem__, default=None)
+    return best if best is not None and left[best] <= _CLEARLY_BETTER else None
 
 
 def _slide(views: tuple[int, int], offsets: SurfaceOffsets, seen: Sequence[ColoredView]) -> list[Misplacement]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from data_gen.inspection.camera_conventions import STORED, CameraConvention, single_mistakes
 from data_gen.inspection.fault import Fault
 from data_gen.inspection.free_space import MAX_SHARE, FreeSpace, free_space_violations
-from data_gen.inspection.pose_agreement import MAX_MISPLACED, Misplacement, misplacements, outlier_view
+from data_gen.inspection.pose_agreement import MAX_MISPLACED, Misplacement, explanation, misplacements, outlier_views
 from data_gen.inspection.posed_depth import PosedDepth
 from data_gen.inspection.trigger_delay import MAX_DELAY, TriggerDelay, trigger_delays
 from data_gen.inspection.view_agreement import MAX_PAIRS, Agreement, compare_views
@@ -31,6 +31,7 @@ from vpd_lightning.errors import DataError
 MAX_RELATIVE_DISTANCE = 0.02  # of the depth: between correct sensors, after leaving out occlusions
 _MAX_FILES_COMPARED = 4
 _MIN_PAIRS = 4  # of images, per file
+_MANY = 4  # times as many pairs are compared where the first ones leave open which view is off
 _NOISY = 1e-3  # of the depth: beyond this it is noise, not the views, that hides small differences
 _PER_FRAME_STATE = (
     schema.STATE_POSITIONS,
@@ -157,12 +158,18 @@ def _check_views(path: Path, max_pairs: int = MAX_PAIRS) -> _Views:
     with TrajectoryReader(path) as reader:
         agreement = compare_views(reader, max_pairs)
         poses = misplacements(reader, max_pairs)
+        worst = outlier_views(poses)
+        if worst is not None and len(worst[0]) > 1:  # other views may tell which of the two it is
+            more = misplacements(reader, _MANY * max_pairs)
+            poses = more if outlier_views(more) is not None else poses
+        undecidable = agreement.undecidable if agreement is not None else ()
+        convention = explanation(reader, max_pairs, undecidable, poses)
     free_space = free_space_violations(path)
     faults = [Fault("cannot_tell", str(path), _STATIC_VIEW, is_error=False)]
     if agreement is not None:
         faults = _judge(path, agreement)
-    if not any(fault.is_error for fault in faults):
-        faults += _judge_poses(path, poses)
+    if not any(fault.is_error for fault in faults) or (agreement is not None and agreement.explanation is None):
+        faults += _judge_poses(path, poses, convention)
     if not any(fault.is_error for fault in faults) and free_space.share > MAX_SHARE:
         faults.append(_judge_free_space(path, free_space))
     return _Views(faults, agreement, free_space)
@@ -211,19 +218,32 @@ def _judge(path: Path, agreement: Agreement) -> list[Fault]:
     return []
 
 
-def _judge_poses(path: Path, found: Sequence[Misplacement]) -> list[Fault]:
-    worst = outlier_view(found)
+def _judge_poses(path: Path, found: Sequence[Misplacement], convention: CameraConvention | None) -> list[Fault]:
+    worst = outlier_views(found)
+    if convention is not None:
+        apart = float(np.median([item.distance / item.depth for item in found]))
+        message = (
+            f"views lie {_percent(apart)} of their depth apart (median over pairs, all their points together); they "
+            f"would agree if {convention}"
+        )
+        if replace(convention, pixel_shift=0.0) == STORED:
+            message += ", but calibration errors of this size look alike"
+        is_error = worst is not None or replace(convention, pixel_shift=0.0) != STORED
+        return [Fault("views_disagree", str(path), message, is_error=is_error)]
     if worst is None:
         return []
-    view, pair = worst
+    suspects, pair = worst
     with TrajectoryReader(path) as reader:
-        name, other = (reader.view_label(one) for one in (view, sum(pair.views) - view))
-    message = (
-        f"the pose of view {name} is off: its {pair.evidence} lie {100 * pair.distance:.2g} cm (standard error "
-        f"{100 * pair.error:.1g} cm) from those of view {other}, {_percent(pair.distance / pair.depth)} of their "
-        f"depth; allowed {_percent(MAX_MISPLACED)}. Calibrate it again (pose, principal point), or trigger the cameras "
-        "together"
-    )
+        named = [reader.view_label(view) for view in suspects]
+        others = [reader.view_label(view) for view in pair.views if view not in suspects]
+    apart = f"{100 * pair.distance:.2g} cm (standard error {100 * pair.error:.1g} cm)"
+    if others:
+        where = f"view {named[0]} is off: its {pair.evidence} lie {apart} from those of view {others[0]}"
+    else:
+        where = f"view {named[0]} or view {named[1]} is off: their {pair.evidence} lie {apart} from each other"
+    remedy = "Calibrate it again (pose, principal point), or trigger the cameras together"
+    share = f"{_percent(pair.distance / pair.depth)} of their depth; allowed {_percent(MAX_MISPLACED)}"
+    message = f"the pose of {where}, {share}. {remedy}"
     return [Fault("pose_off", str(path), message)]
 
 

@@ -41,12 +41,12 @@ def positions_in_millimetres(trajectory: Trajectory) -> Trajectory:
 
 
 def ray_lengths(trajectory: Trajectory) -> np.ndarray:
-    """Length of each pixel's ray per unit of z, written out for intrinsics that all views share."""
+    """Length of each pixel's ray per unit of z, (view, height, width) or with time before."""
     height, width = trajectory.depth.shape[2:]
-    matrix = trajectory.intrinsics.reshape(-1, 3, 3)[0]
-    x = (np.arange(width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
-    y = (np.arange(height) + 0.5 - matrix[1, 2]) / matrix[1, 1]
-    return np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
+    matrix = trajectory.intrinsics[..., None, None]
+    x = (np.arange(width) + 0.5 - matrix[..., 0, 2, :, :]) / matrix[..., 0, 0, :, :]
+    y = (np.arange(height)[:, None] + 0.5 - matrix[..., 1, 2, :, :]) / matrix[..., 1, 1, :, :]
+    return np.sqrt(1 + x**2 + y**2).astype(np.float32)
 
 
 def as_distance(trajectory: Trajectory) -> Trajectory:
