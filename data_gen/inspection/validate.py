@@ -236,11 +236,11 @@ def _judge_poses(path: Path, found: Sequence[Misplacement], convention: CameraCo
     with TrajectoryReader(path) as reader:
         named = [reader.view_label(view) for view in suspects]
         others = [reader.view_label(view) for view in pair.views if view not in suspects]
-    apart = f"{100 * pair.distance:.2g} cm (standard error {100 * pair.error:.1g} cm)"
+    length = f"{100 * pair.distance:.2g} cm (standard error {100 * pair.error:.1g} cm)"
     if others:
-        where = f"view {named[0]} is off: its {pair.evidence} lie {apart} from those of view {others[0]}"
+        where = f"view {named[0]} is off: its {pair.evidence} lie {length} from those of view {others[0]}"
     else:
-        where = f"view {named[0]} or view {named[1]} is off: their {pair.evidence} lie {apart} from each other"
+        where = f"view {named[0]} or view {named[1]} is off: their {pair.evidence} lie {length} from each other"
     remedy = "Calibrate it again (pose, principal point), or trigger the cameras together"
     share = f"{_percent(pair.distance / pair.depth)} of their depth; allowed {_percent(MAX_MISPLACED)}"
     message = f"the pose of {where}, {share}. {remedy}"
