@@ -3,6 +3,8 @@
 from collections import defaultdict
 from pathlib import Path
 
+import torch
+
 from benchmarks import plots
 from benchmarks.arithmetic import TRAINING, Work, dynamics_layers, edge_counts, encoder_layers, renderer_layers, work
 from benchmarks.measuring import Options, Result, Row, Stopwatch, copy_rate, device_peak, gemm_rate, row
@@ -116,11 +118,26 @@ def _floors(step: Step, rows: list[Row], options: Options) -> dict[str, object]:
     facts["networks_floor_seconds"] = total
     facts["networks_floor_share_fast"] = total / (fast or 1.0)
     facts["networks_floor_share_plain"] = total / (plain or 1.0)
+    facts |= _bfloat16_floor(list(stages.values()), rows, moved, options)
     layers = renderer_layers(simulator.renderer, rays, is_plain=True)
     plain_work = several(work(dynamics_layers(simulator.dynamics, counts, is_plain=True)))
     as_written = stages["encode"].operations + plain_work.operations + work(layers).operations
     facts["operations_saved"] = 1 - sum(amount.operations for amount in stages.values()) / as_written
     return facts
+
+
+def _bfloat16_floor(stages: list[Work], rows: list[Row], moved: float, options: Options) -> dict[str, object]:
+    """Return the floor of the step in bfloat16, where numbers are half as long, and how near the step is to it."""
+    rate = gemm_rate(options.device, torch.bfloat16)
+    halved = [Work(amount.operations, amount.bytes / 2) for amount in stages]
+    floor = TRAINING * sum(amount.seconds(rate, moved) for amount in halved)
+    bf16, literal = (next(r.seconds for r in rows if r.name == f"train_step/{v}") for v in ("bf16", LITERAL))
+    return {
+        "bfloat16_gemm_operations_per_second": rate,
+        "bfloat16_networks_floor_seconds": floor,
+        "bfloat16_networks_floor_share": floor / (bf16 or 1.0),
+        "literal_over_bfloat16_networks_floor": (literal or 0.0) / floor,
+    }
 
 
 def draw(result: Result, path: Path) -> None:
