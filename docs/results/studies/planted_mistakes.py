@@ -3,22 +3,25 @@
 ``python -m docs.results.studies.planted_mistakes NAME=FOLDER ... --out docs/results/planted_mistakes.json``. Of each
 data set's training split the first ``--recordings`` are taken, as they are and as a sensor of ``SENSORS`` would have
 recorded their depth. Every mistake of ``MISTAKES`` is planted into all of them; a pose is off by ``POSE_OFF`` of the
-median depth (3 cm at 1.4 m). ``faults`` are the errors that are found, ``named`` whether one of them has the words of
-the mistake, for a pose those of the right view. Where that cannot be decided, ``cannot_tell`` is the remark that says
-so. A late trigger has a study of its own (``trigger_delay.py``).
+median depth (3 cm at 1.4 m). ``verdict`` is "named" where an error has the words of the mistake (for a pose, those of
+that view alone; for swapped cameras, that these two or the calibration are wrong), "one of two" where a pose's error
+names another view beside, "another fault" where there is an error that says something else, "remark" where it is said
+and passed, "cannot tell" where a remark lists what cannot be told. A late trigger has a study of its own
+(``trigger_delay.py``).
 """
 
 import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from data_gen.inspection.fault import Fault
 from data_gen.inspection.validate import check_dataset
 from tests.data_gen.inspection.mistakes import (
     Change,
@@ -56,28 +59,30 @@ def _swapped(trajectory: Trajectory) -> Trajectory:
     return replace(trajectory, cam_to_world=trajectory.cam_to_world[..., order, :, :])
 
 
+_ALONE = (f"the pose of view {OFF_VIEW} is off",)
+_SWAPPED = ("the pose of view 0 or view 1 is off", "are the cameras calibrated, and do their times agree?")
 MISTAKES: dict[str, tuple[Change, tuple[str, ...]]] = {
     "nothing": (lambda trajectory: trajectory, ()),
-    "axes of OpenGL": (opengl, ("OpenGL",)),
-    "distance along the ray": (as_distance, ("distance",)),
-    "depth in millimetres": (scaled(1000.0), ("",)),
-    "positions in millimetres": (positions_in_millimetres, ("",)),
-    "cameras swapped": (_swapped, ("",)),
-    "poses inverted": (inverted, ("invert",)),
-    "a pose off along x": (_moved(0), (f"view {OFF_VIEW} is off",)),
-    "a pose off along y": (_moved(1), (f"view {OFF_VIEW} is off",)),
-    "a pose off along z": (_moved(2), (f"view {OFF_VIEW} is off",)),
-    "half a pixel": (shifted(0.5), ("principal point",)),
+    "axes of OpenGL": (opengl, ("the camera axes are OpenGL's",)),
+    "distance along the ray": (as_distance, ("depth is the distance to the camera centre",)),
+    "depth in millimetres": (scaled(1000.0), ("depth is in millimetres",)),
+    "positions in millimetres": (positions_in_millimetres, ("the positions in cam_to_world are in millimetres",)),
+    "cameras swapped": (_swapped, _SWAPPED),
+    "poses inverted": (inverted, ("cam_to_world is world_to_cam: invert it",)),
+    "a pose off along x": (_moved(0), _ALONE),
+    "a pose off along y": (_moved(1), _ALONE),
+    "a pose off along z": (_moved(2), _ALONE),
+    "half a pixel": (shifted(0.5), ("the principal point has 0.5 too much",)),
 }
+_ONE_OF_TWO = (f"the pose of view {OFF_VIEW} or view", f"or view {OFF_VIEW} is off")
 
 
 def recorded(path: Path, sensor: str) -> Trajectory:
-    """Read the first frames of a recording, depth as the sensor measures it."""
+    """Read some ``NUM_FRAMES`` frames of a recording, depth as the sensor measures it."""
     with TrajectoryReader(path) as reader:
         times = list(range(0, reader.num_frames, max(1, reader.num_frames // NUM_FRAMES)))
         depth = reader.depth(times)
-        cameras = [reader.cameras([moment]) for moment in times]
-        intrinsics, poses = (np.stack([frame[part][0] for frame in cameras]) for part in (0, 1))
+        intrinsics, poses = reader.cameras(times)
         settings = load_sensor(sensor, SENSORS[sensor])
         if settings is not None:
             middle = median_depth(depth[0], reader.far)
@@ -109,34 +114,26 @@ def judged(trajectories: Sequence[Trajectory], change: Change, words: Sequence[s
     faults = [fault for fault in faults if fault.name != "manifest"]  # files without a manifest are meant here
     errors = [fault for fault in faults if fault.is_error]
     return {
+        "verdict": verdict(faults, words),
         "faults": sorted({fault.name for fault in errors}),
-        "named": any(word in fault.message for fault in errors for word in words),
-        "remarked": any(word in fault.message for fault in faults if fault.name == "views_disagree" for word in words),
-        "cannot_tell": any(fault.name == "cannot_tell" for fault in faults),
         "seconds": seconds,
-        "messages": sorted({fault.message for fault in faults})[:4],
+        "messages": sorted({fault.message for fault in faults}),
     }
 
 
-def table(cells: dict[str, dict[str, Any]], names: Sequence[str], write: Callable[[str], Any] = print) -> None:
-    """Print a row for each mistake, a column for each data set and sensor."""
-    columns = [f"{name}, {sensor}" for name in names for sensor in SENSORS]
-    write(f"{'':24s}" + " | ".join(columns))
-    for mistake in MISTAKES:
-        row = [cells[f"{column.replace(', ', '/')}"][mistake] for column in columns]
-        words = [
-            "named"
-            if cell["named"]
-            else "remark"
-            if cell["remarked"]
-            else "fault"
-            if cell["faults"]
-            else "cannot tell"
-            if cell["cannot_tell"]
-            else "-"
-            for cell in row
-        ]
-        write(f"{mistake:24s}" + " | ".join(words))
+def verdict(faults: Sequence[Fault], words: Sequence[str]) -> str:
+    """Return the best that is said of a mistake with these words."""
+    errors = [fault.message for fault in faults if fault.is_error]
+    remarks = [fault.message for fault in faults if fault.name == "views_disagree"]
+    if any(word in message for message in errors for word in words):
+        return "named"
+    if words == _ALONE and any(word in message for message in errors for word in _ONE_OF_TWO):
+        return "one of two"
+    if errors:
+        return "another fault"
+    if any(word in message for message in remarks for word in words):
+        return "remark"
+    return "cannot tell" if any(fault.name == "cannot_tell" for fault in faults) else "nothing"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -147,10 +144,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--recordings", type=int, default=2)
     options = parser.parse_args(arguments)
     cells: dict[str, dict[str, Any]] = {}
-    names = []
     for word in options.data:
         name, _, folder = word.partition("=")
-        names.append(name)
         paths = sorted(load_manifest(folder).splits["train"])[: options.recordings]
         for sensor in SENSORS:
             trajectories = [recorded(path, sensor) for path in paths]
@@ -159,7 +154,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             }
     with AtomicPath(options.out) as partial:
         partial.write_text(json.dumps({"num_recordings": options.recordings, "cells": cells}, indent=1) + "\n")
-    table(cells, names)
+    for mistake in MISTAKES:
+        print(f"{mistake:26s}" + " | ".join(f"{name} {cell[mistake]['verdict']}" for name, cell in cells.items()))
     return 0
 
 
