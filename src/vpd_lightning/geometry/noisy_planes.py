@@ -52,6 +52,9 @@ _MIN_PIXELS = 5
 _MIN_DEVIATIONS = 3.0
 """Pixels of a body, and their median distance from the planes in standard deviations; less is a patch of noise."""
 
+_SMALL, _MIN_DEVIATIONS_OF_SMALL = 20, 4.5
+"""With fewer pixels than this it must be farther off: neighbours err alike, so noise comes in patches of about ten."""
+
 
 @dataclass(frozen=True)
 class _Views:
@@ -323,7 +326,8 @@ def _without_specks(moving: NDArray[np.bool_], deviations: NDArray[np.float64]) 
     kept = np.zeros(count + 1, bool)
     for name in range(1, count + 1):
         mine = deviations[names == name]
-        kept[name] = len(mine) >= _MIN_PIXELS and np.median(mine) >= _MIN_DEVIATIONS
+        limit = _MIN_DEVIATIONS_OF_SMALL if len(mine) < _SMALL else _MIN_DEVIATIONS
+        kept[name] = len(mine) >= _MIN_PIXELS and np.median(mine) >= limit
     return kept[names]
 
 
