@@ -110,7 +110,7 @@ def simulator(has_background=True):
         feature_dim=5, color_features=False, background_frequencies=0, hidden_dim=16,
         num_layers=2, num_candidates=8, surface_scale=0.1, kernel_scales=[0.5, 2.0],
         layer_depth=1.0, near=0.1, far=10.0, ray_chunk_size=64, candidate_backend="auto",
-        facing_softness=None, has_scenery=False, num_scenery_candidates=12, elliptic_footprints=True, far_pixels=False,
+        facing_softness=None, has_scenery=False, num_scenery_candidates=12, elliptic_footprints=True, far_pixels=False, seen_through=False,
         unseen_ground=False,
         num_lights=0, num_occluders=9,
         shadow_softness=0.5,

@@ -53,6 +53,7 @@ def layer(**changes):
         "backend": "torch",
         "elliptic": True,
         "far_pixels": True,
+        "seen_through": True,
     }
     return SceneryLayer(**settings | changes).double()
 

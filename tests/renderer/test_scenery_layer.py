@@ -18,6 +18,7 @@ def layer(num_candidates, **changes):
         "backend": "torch",
         "elliptic": True,
         "far_pixels": True,
+        "seen_through": True,
     }
     return SceneryLayer(**settings | changes).double()
 

@@ -32,6 +32,7 @@ SETTINGS = {
     "num_scenery_candidates": 12,
     "elliptic_footprints": True,
     "far_pixels": True,
+    "seen_through": True,
     "unseen_ground": True,
     "num_lights": 0,
     "num_occluders": 512,

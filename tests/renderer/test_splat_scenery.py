@@ -22,6 +22,7 @@ def renderer(**changes):
             "num_scenery_candidates": 12,
             "elliptic_footprints": True,
             "far_pixels": True,
+            "seen_through": True,
             "unseen_ground": False,
             "num_lights": 1,
             "shadow_softness": 0.5,

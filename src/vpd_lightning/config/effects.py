@@ -31,6 +31,7 @@ _ONLY_WITH: dict[str, tuple[str, Callable[[Any], bool], str]] = {
     "generate.when_missing": ("generate.scene", bool, "the name of a scene"),
     "renderer.elliptic_footprints": ("renderer.has_scenery", bool, "true"),
     "renderer.far_pixels": ("renderer.has_scenery", bool, "true"),
+    "renderer.seen_through": ("renderer.has_scenery", bool, "true"),
     "renderer.unseen_ground": ("renderer.has_scenery", bool, "true"),
     "dynamics.guess_hidden": ("dynamics.keep_shape", bool, "true"),
     "renderer.num_scenery_candidates": ("renderer.has_scenery", bool, "true"),

@@ -64,6 +64,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "num_scenery_candidates": 12,
         "elliptic_footprints": False,
         "far_pixels": False,
+        "seen_through": False,
         "unseen_ground": False,
         "num_lights": 0,
         "num_occluders": 512,

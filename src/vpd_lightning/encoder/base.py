@@ -31,9 +31,14 @@ class AbstractBackground(nn.Module, ABC):
     def forward(self, frames: RGBDFrames) -> Bool[Tensor, "batch view height width"]:
         """Return which pixels may be moving."""
 
-    def restored(self, frames: RGBDFrames) -> Float[Tensor, "batch view height width"]:
-        """Return the depth (metres) that particles are placed by; here the measured one."""
-        return frames.depth
+    def restored(
+        self, frames: RGBDFrames
+    ) -> tuple[Float[Tensor, "batch view height width"], Float[Tensor, "batch view height width"]]:
+        """Return the depth (metres) by which it is judged what moves, and that which places the particles.
+
+        Here both are the measured one.
+        """
+        return frames.depth, frames.depth
 
     def trusted(
         self, frames: RGBDFrames, moving: Bool[Tensor, "batch view height width"]

@@ -1,7 +1,9 @@
 """Noisy depth as planes fitted around every pixel: it scatters less, and pixels beside a surface get its depth."""
 
+import math
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vpd_lightning.geometry.decay import decay
@@ -28,6 +30,29 @@ _MIN_WEIGHT = 1.0
 
 _MAX_CORRECTION = 4.0
 """Standard deviations of the noise by which a fit may move what was measured."""
+
+
+_STEEP, _MOST_ALIKE = 4.0, 1
+"""Pixel sizes by which neighbours on one surface differ in depth, and like neighbours of a pixel that is on none."""
+
+
+@torch.no_grad()
+def between_surfaces(
+    depth: Float[Tensor, "image height width"], noise: Float[Tensor, " image"], pixel_sizes: Float[Tensor, " image"]
+) -> Bool[Tensor, "image height width"]:
+    """Return the measured pixels that hang in the air between a nearer and a farther surface.
+
+    At most one of their eight neighbours is at a like distance: within three standard deviations of the difference of
+    two, or as far as a steep surface leads. See ``plane_depth`` for the arguments.
+    """
+    depth = torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0).clamp(min=0)
+    around = torch.nn.functional.unfold(depth[:, None], 3, padding=1).unflatten(2, depth.shape[1:])
+    around, own = torch.cat([around[:, :4], around[:, 5:]], dim=1), depth[:, None]
+    reach = torch.maximum(3 * math.sqrt(2) * noise, _STEEP * pixel_sizes).to(depth)[:, None, None, None] * own
+    known = around > 0
+    alike = (known & ((around - own).abs() <= reach)).sum(dim=1)
+    nearer, farther = (known & (around < own - reach)).any(dim=1), (known & (around > own + reach)).any(dim=1)
+    return (depth > 0) & (alike <= _MOST_ALIKE) & nearer & farther
 
 
 @torch.no_grad()

@@ -52,6 +52,10 @@ _MIN_PIXELS = 5
 _MIN_DEVIATIONS = 3.0
 """Pixels of a body, and their median distance from the planes in standard deviations; less is a patch of noise."""
 
+_MOST_IN_FRONT, _RIM_LENGTH = 0.1, 2.5
+"""A strip of so many times its width, of which no more than this share lies in front of its plane, is the plane's rim:
+the side of a table top. What stands on a plane lies in front of it."""
+
 _SMALL, _MIN_DEVIATIONS_OF_SMALL = 20, 4.5
 """With fewer pixels than this it must be farther off: neighbours err alike, so noise comes in patches of about ten."""
 
@@ -135,7 +139,7 @@ def off_wide_planes(
         reach = np.maximum(_ALIKE * np.sqrt(2) * scatters[view], _MAX_STEEPNESS * pixel_sizes[view])
         with np.errstate(invalid="ignore"):
             moving = _without_flying(moving, signed[view] * scatters[view], reach)
-        result[view] = _without_specks(moving, np.abs(signed[view]))
+        result[view] = _without_specks(moving, signed[view], views.points[view])
     # What lies beside a body in the picture alone, and half a metre off, would drag it along where it meets the floor.
     return result & ~hangs_alone(views.points, result, views.depth * pixel_sizes[:, None, None])
 
@@ -321,14 +325,27 @@ def _apart(padded: NDArray[np.float64], shift: tuple[int, int]) -> NDArray[np.fl
     return apart
 
 
-def _without_specks(moving: NDArray[np.bool_], deviations: NDArray[np.float64]) -> Bool[NDArray[np.bool_], "h w"]:
+def _without_specks(
+    moving: NDArray[np.bool_], signed: NDArray[np.float64], points: NDArray[np.float64]
+) -> Bool[NDArray[np.bool_], "height width"]:
+    """Return moving pixels without patches of noise and without the sides that wide planes have at their edges.
+
+    ``signed`` is how many standard deviations a pixel lies behind its nearest plane, ``points`` where (metres).
+    """
     names, count = label(moving, structure=np.ones((3, 3)))
     kept = np.zeros(count + 1, bool)
     for name in range(1, count + 1):
-        mine = deviations[names == name]
-        limit = _MIN_DEVIATIONS_OF_SMALL if len(mine) < _SMALL else _MIN_DEVIATIONS
-        kept[name] = len(mine) >= _MIN_PIXELS and np.median(mine) >= limit
+        mine = names == name
+        behind = signed[mine]
+        limit = _MIN_DEVIATIONS_OF_SMALL if len(behind) < _SMALL else _MIN_DEVIATIONS
+        is_body = len(behind) >= _MIN_PIXELS and np.median(np.abs(behind)) >= limit
+        kept[name] = is_body and not (np.quantile(behind, _MOST_IN_FRONT) > 0 and _is_long(points[mine]))
     return kept[names]
+
+
+def _is_long(points: NDArray[np.float64]) -> bool:
+    widths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(widths[0] > _RIM_LENGTH * widths[1])
 
 
 def _not_zero(values: NDArray[np.float64]) -> NDArray[np.float64]:

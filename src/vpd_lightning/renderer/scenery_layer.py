@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from vpd_lightning.geometry.decay import decay
 from vpd_lightning.renderer.far_pixels import seen_far
 from vpd_lightning.renderer.kernels.ray_search import RaySearch
-from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
+from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind, BesideRay
 from vpd_lightning.types import Rays, Scenery
 
 _REACH, _REACH_ELLIPTIC = 2.0, 1.5
@@ -22,6 +22,13 @@ _EDGE, _EDGE_ELLIPTIC = 8.0, 16.0
 _STEEPEST = 4.0
 """Most widths that a pixel seen at a grazing angle counts along the surface; twice as many where footprints are
 elliptic."""
+
+
+_CLOSER, _SEEN_ALONG = 0.3, 0.2
+"""Pixel widths by which a ray may pass another point more closely and still meet a surface, and the angle (radians)
+from how that point was seen at which it counts as one width farther off."""
+
+_NUM_BESIDE, _FAR = 2, 1e9
 
 
 class SeenScenery(NamedTuple):
@@ -55,13 +62,24 @@ class SceneryLayer(nn.Module):
     the finer it was seen; not where it faces away, nor behind another surface. The ray meets the tangent planes of the
     points, so a floor has its exact depth. Near is what the camera that saw a point sees near it: the footprint of a
     pixel is an ellipse on its plane (as in EWA splatting, Zwicker et al. 2001); where not ``elliptic`` it is a disc as
-    wide as that ellipse is long. With ``far_pixels`` a ray also sees, behind the points, the pixels that measured no
+    wide as that ellipse is long. With ``seen_through`` a surface ends where a camera saw past it: a ray that passes a
+    point of what is behind more closely, and along the way it was seen, does not meet what reaches beside that. With
+    ``far_pixels`` a ray also sees, behind the points, the pixels that measured no
     distance, in whose direction it leads.
     """
 
-    def __init__(self, *, num_candidates: int, near: float, backend: str, elliptic: bool, far_pixels: bool):
+    def __init__(
+        self,
+        *,
+        num_candidates: int,
+        near: float,
+        backend: str,
+        elliptic: bool,
+        far_pixels: bool,
+        seen_through: bool,
+    ):
         super().__init__()
-        self.far_pixels = far_pixels
+        self.far_pixels, self.seen_through = far_pixels, seen_through
         self.num_candidates, self.near, self.backend, self.elliptic = num_candidates, near, backend, elliptic
         self.log_width = nn.Parameter(torch.tensor(math.log(0.5)))  # of a pixel
         self.log_angle = nn.Parameter(torch.tensor(math.log(0.2)))  # radians
@@ -107,14 +125,20 @@ class SceneryLayer(nn.Module):
             grazing = (normals * views).sum(dim=-1).abs().clamp(min=1 / _STEEPEST)
             spread, reach = beside, sizes / torch.where(known, grazing, 1.0)
             most, edge = _REACH, _EDGE
-        first = (met + 2 * (spread - most * reach).clamp(min=0)).masked_fill(~usable, torch.inf).amin(-1, True)
+        turn = 2 - 2 * (views * directions).sum(dim=-1)  # about the square of the angle
+        meets = usable
+        if self.seen_through:
+            apart = spread / reach
+            closest = (apart + turn / _SEEN_ALONG**2).masked_fill(~usable, torch.inf).amin(-1, True)
+            meets = usable & (apart < closest + _CLOSER)
+        first = (met + 2 * (spread - most * reach).clamp(min=0)).masked_fill(~meets, torch.inf).amin(-1, True)
         depth = 3 * sizes
+        shown = usable & (meets | (met > first - depth))
         before = nn.functional.logsigmoid((first.clamp(max=1e6) + depth - met) / (0.3 * depth))
         width = sizes * self.log_width.exp()
-        turn = 2 - 2 * (views * directions).sum(dim=-1)  # about the square of the angle
         logits = before - 0.5 * (spread / width).square() - 0.5 * turn * (-2 * self.log_angle).exp() - 2 * sizes.log()
-        logits = logits.masked_fill(~usable, -1e30)
-        kernels = decay(logits - logits.detach().amax(dim=-1, keepdim=True)) * usable
+        logits = logits.masked_fill(~shown, -1e30)
+        kernels = decay(logits - logits.detach().amax(dim=-1, keepdim=True)) * shown
         weights = kernels / kernels.sum(dim=-1, keepdim=True).clamp(min=1e-30)
         colors = (weights[:, :, None] @ gather(scenery.colors)).squeeze(2)
         distances = (weights * met).sum(dim=-1)
@@ -133,7 +157,10 @@ class SceneryLayer(nn.Module):
 
     @torch.no_grad()
     def _candidates(self, scenery: Scenery, rays: Rays) -> Int[Tensor, "batch ray candidate"]:
-        """Choose the points closest to each ray, hidden ones last, none behind the camera; -1 for none."""
+        """Choose the points closest to each ray, hidden ones last, none behind the camera; -1 for none.
+
+        With ``seen_through`` those nearest beside it, however far behind, stand last.
+        """
         sizes = torch.where(scenery.mask, scenery.sizes, torch.nan).nanmedian(dim=1).values
         chosen = []
         for member, width in enumerate(torch.nan_to_num(sizes, nan=1.0).tolist()):  # each has a width of its own
@@ -141,5 +168,11 @@ class SceneryLayer(nn.Module):
             score = BesideAndBehind(self.near, 1.5 * width, 8 * width)
             search = RaySearch(scenery.positions[some], scenery.mask[some], self.backend)
             found = search.closest(rays.origins[some], rays.directions[some], self.num_candidates, score)
-            chosen.append(torch.where(found.mask, found.index, -1))
+            index = torch.where(found.mask, found.index, -1)
+            if self.seen_through:  # what is far behind the first surface is not among those
+                beside = BesideRay(self.near, _FAR)
+                found = search.closest(rays.origins[some], rays.directions[some], _NUM_BESIDE, beside)
+                is_new = found.mask & (found.index[..., None] != index[..., None, :]).all(dim=-1)
+                index = torch.cat([index, torch.where(is_new, found.index, -1)], dim=-1)
+            chosen.append(index)
         return torch.cat(chosen)

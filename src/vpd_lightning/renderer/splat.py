@@ -81,6 +81,7 @@ class SplatRenderer(AbstractRenderer):
         num_scenery_candidates: int,
         elliptic_footprints: bool,
         far_pixels: bool,
+        seen_through: bool,
         unseen_ground: bool,
         num_lights: int,
         num_occluders: int,
@@ -142,6 +143,7 @@ class SplatRenderer(AbstractRenderer):
                 backend=candidate_backend,
                 elliptic=elliptic_footprints,
                 far_pixels=far_pixels,
+                seen_through=seen_through,
             )
             if num_lights:
                 self.shadows = Shadows(num_lights=num_lights, softness=surface_scale * shadow_softness)

@@ -174,15 +174,11 @@ class UnprojectingEncoder(AbstractEncoder):
         return shows_driven(frames).flatten(1)
 
     def _restored(self, frames: RGBDFrames) -> tuple[RGBDFrames, RGBDFrames]:
-        """Return the frames by which it is judged what moves, and those whose depth places the particles.
-
-        What was measured is judged as it was measured: thresholds follow from its noise.
-        """
+        """Return the frames by which it is judged what moves, and those whose depth places the particles."""
         if self.background is None:
             return frames, frames
-        depth = self.background.restored(frames)
-        measured = torch.isfinite(frames.depth) & (frames.depth > 0)
-        return replace(frames, depth=torch.where(measured, frames.depth, depth)), replace(frames, depth=depth)
+        judged, placed = self.background.restored(frames)
+        return replace(frames, depth=judged), replace(frames, depth=placed)
 
     @torch.no_grad()
     def moving_pixels(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vpd_lightning.encoder.base import AbstractBackground
 from vpd_lightning.geometry.cameras import unproject
-from vpd_lightning.geometry.local_planes import plane_depth
+from vpd_lightning.geometry.local_planes import between_surfaces, plane_depth
 from vpd_lightning.geometry.noisy_planes import hangs_alone, off_wide_planes, relative_noise
 from vpd_lightning.geometry.normals import depth_normals
 from vpd_lightning.geometry.wide_surfaces import wide_surfaces
@@ -81,11 +81,27 @@ class WideSurfaceBackground(AbstractBackground):
         return torch.stack(members).to(frames.depth.device)
 
     @torch.no_grad()
-    def restored(self, frames: RGBDFrames) -> Float[Tensor, "batch view height width"]:
-        """Return the depth (metres) of local planes where it is noisy, and where it is missing beside a surface."""
+    def restored(
+        self, frames: RGBDFrames
+    ) -> tuple[Float[Tensor, "batch view height width"], Float[Tensor, "batch view height width"]]:
+        """Return the depth (metres) by which it is judged what moves, and that which places the particles.
+
+        The second is that of local planes where depth is noisy, where it is missing beside a surface, and where it
+        hangs between two. What lies on a surface is judged as it was measured: thresholds follow from its noise.
+        """
         if self.noise_floor is None:
-            return frames.depth
-        return torch.stack([self._restored_member(frames[member]) for member in range(len(frames.depth))])
+            return frames.depth, frames.depth
+        members = [frames[member] for member in range(len(frames.depth))]
+        placed = torch.stack([self._restored_member(member) for member in members])
+        hanging = torch.stack([self._hanging(member) for member in members]).to(placed.device)
+        measured = torch.isfinite(frames.depth) & (frames.depth > 0)
+        return torch.where(measured & ~hanging, frames.depth, placed), placed
+
+    def _hanging(self, frames: RGBDFrames) -> Bool[Tensor, "view height width"]:
+        depth, _, noise = self._measured(frames.to("cpu", torch.float32))
+        if noise is None:
+            return torch.zeros_like(depth, dtype=torch.bool)
+        return between_surfaces(depth, torch.from_numpy(noise), torch.from_numpy(_pixel_sizes(frames)))
 
     def _restored_member(self, frames: RGBDFrames) -> Float[Tensor, "view height width"]:
         key, memory = _digest(frames, frames.rgb), self._restored
@@ -106,8 +122,10 @@ class WideSurfaceBackground(AbstractBackground):
         depth, _, noise = self._measured(frames)
         if noise is None:
             return None
-        sizes = torch.from_numpy(_pixel_sizes(frames)).float()
-        return plane_depth(depth, frames.rgb, torch.from_numpy(noise).float(), sizes).numpy()
+        noise, sizes = torch.from_numpy(noise).float(), torch.from_numpy(_pixel_sizes(frames)).float()
+        hanging = between_surfaces(depth, noise, sizes)
+        found = plane_depth(torch.where(hanging, 0.0, depth), frames.rgb, noise, sizes)
+        return torch.where(hanging & (found == 0), depth, found).numpy()
 
     @torch.no_grad()
     def trusted(
