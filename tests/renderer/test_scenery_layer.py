@@ -60,7 +60,7 @@ def random_scene(batch=2, count=30, num_rays=25, seed=0):
     return scenery(positions, uniform(batch, count, 3), normals, views, sizes, uniform(batch, count) > 0.2), rays
 
 
-def plain_ray(points, origin, direction, width, angle, elliptic):
+def plain_ray(points, origin, direction, width, angle, elliptic, seen_through):
     """One ray past points (dictionaries), by the words of the class: colour, distance, opacity. NumPy, float64."""
     usable = []
     for point in points:
@@ -84,12 +84,21 @@ def plain_ray(points, origin, direction, width, angle, elliptic):
     if not usable:
         return np.zeros(3), 0.0, 0.0
     most = 1.5 if elliptic else 2.0
-    first = min(met + 2 * max(beside - most * reach, 0.0) for _, beside, met, reach in usable)
+    turns = [float(np.sum((point["view"] - direction) ** 2)) for point, *_ in usable]
+    apart = [beside / reach for _, beside, _, reach in usable]
+    closest = min(one + turn / 0.2**2 for one, turn in zip(apart, turns, strict=True))
+    meets = [not seen_through or one < closest + 0.3 for one in apart]
+    first = min(
+        (met + 2 * max(beside - most * reach, 0.0) for (_, beside, met, reach), does in zip(usable, meets) if does),
+        default=math.inf,
+    )
     logs = []
-    for point, beside, met, _ in usable:
+    for (point, beside, met, _), does, turn in zip(usable, meets, turns, strict=True):
+        if not does and met <= first - 3 * point["size"]:
+            logs.append(-1e30)
+            continue
         # the logarithm of a sigmoid, for any size of its argument
         in_front = -np.logaddexp(0.0, -(first + 3 * point["size"] - met) / (0.9 * point["size"]))
-        turn = float(np.sum((point["view"] - direction) ** 2))
         logs.append(
             in_front
             - 0.5 * (beside / (width * point["size"])) ** 2
@@ -119,15 +128,15 @@ def plain(model, scene, rays):
         arrays = {name: values[member].numpy() for name, values in parts.items()}
         points = [{name: values[i] for name, values in arrays.items()} for i in range(scene.sizes.shape[1])]
         for origin, direction in zip(rays.origins[member].numpy(), rays.directions[member].numpy(), strict=True):
-            found.append(plain_ray(points, origin, direction, width, angle, model.elliptic))
+            found.append(plain_ray(points, origin, direction, width, angle, model.elliptic, model.seen_through))
     shape = rays.origins.shape[:2]
     return [torch.tensor(np.array(values)).unflatten(0, shape) for values in zip(*found, strict=True)]
 
 
-@pytest.mark.parametrize("elliptic", [True, False])
+@pytest.mark.parametrize(("elliptic", "seen_through"), [(True, True), (True, False), (False, True), (False, False)])
 @pytest.mark.parametrize("seed", range(3))
-def test_rays_see_what_plain_loops_see(seed, elliptic):
-    model, (scene, rays) = layer(40, elliptic=elliptic), random_scene(seed=seed)
+def test_rays_see_what_plain_loops_see(seed, elliptic, seen_through):
+    model, (scene, rays) = layer(40, elliptic=elliptic, seen_through=seen_through), random_scene(seed=seed)
     with torch.no_grad():
         model.log_width.fill_(math.log(0.8))
         model.log_angle.fill_(math.log(0.3))

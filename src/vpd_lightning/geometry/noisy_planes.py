@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.ndimage import label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 _STEP = 3
@@ -52,9 +54,8 @@ _MIN_PIXELS = 5
 _MIN_DEVIATIONS = 3.0
 """Pixels of a body, and their median distance from the planes in standard deviations; less is a patch of noise."""
 
-_MOST_IN_FRONT, _RIM_LENGTH = 0.1, 2.5
-"""A strip of so many times its width, of which no more than this share lies in front of its plane, is the plane's rim:
-the side of a table top. What stands on a plane lies in front of it."""
+_RIM_LENGTH = 2.0
+"""How many times as long as it is high a strip behind the edge of a plane is the plane's rim."""
 
 _SMALL, _MIN_DEVIATIONS_OF_SMALL = 20, 4.5
 """With fewer pixels than this it must be farther off: neighbours err alike, so noise comes in patches of about ten."""
@@ -133,13 +134,16 @@ def off_wide_planes(
     every = np.stack([deviations for deviations, _ in judged])
     nearest = np.abs(every).argmin(axis=0)[None]
     signed, scatters = (np.take_along_axis(np.stack(parts), nearest, axis=0)[0] for parts in zip(*judged, strict=True))
+    normals, heights = np.stack(planes)[nearest[0]][..., :3], np.stack(planes)[nearest[0]][..., 3]
+    beside = np.abs((views.points * normals).sum(axis=-1) - heights)  # metres
     result = np.zeros_like(valid)
     for view, there in enumerate(valid):
         moving = _settled(signed[view], there)
         reach = np.maximum(_ALIKE * np.sqrt(2) * scatters[view], _MAX_STEEPNESS * pixel_sizes[view])
         with np.errstate(invalid="ignore"):
-            moving = _without_flying(moving, signed[view] * scatters[view], reach)
-        result[view] = _without_specks(moving, signed[view], views.points[view])
+            shares = signed[view] * scatters[view]
+            moving = _without_specks(_without_flying(moving, shares, reach), np.abs(signed[view]))
+            result[view] = moving & ~_rims(moving & (shares > 0), shares, reach, views.points[view], beside[view])
     # What lies beside a body in the picture alone, and half a metre off, would drag it along where it meets the floor.
     return result & ~hangs_alone(views.points, result, views.depth * pixel_sizes[:, None, None])
 
@@ -325,27 +329,46 @@ def _apart(padded: NDArray[np.float64], shift: tuple[int, int]) -> NDArray[np.fl
     return apart
 
 
-def _without_specks(
-    moving: NDArray[np.bool_], signed: NDArray[np.float64], points: NDArray[np.float64]
-) -> Bool[NDArray[np.bool_], "height width"]:
-    """Return moving pixels without patches of noise and without the sides that wide planes have at their edges.
-
-    ``signed`` is how many standard deviations a pixel lies behind its nearest plane, ``points`` where (metres).
-    """
+def _without_specks(moving: NDArray[np.bool_], deviations: NDArray[np.float64]) -> Bool[NDArray[np.bool_], "h w"]:
     names, count = label(moving, structure=np.ones((3, 3)))
     kept = np.zeros(count + 1, bool)
     for name in range(1, count + 1):
-        mine = names == name
-        behind = signed[mine]
-        limit = _MIN_DEVIATIONS_OF_SMALL if len(behind) < _SMALL else _MIN_DEVIATIONS
-        is_body = len(behind) >= _MIN_PIXELS and np.median(np.abs(behind)) >= limit
-        kept[name] = is_body and not (np.quantile(behind, _MOST_IN_FRONT) > 0 and _is_long(points[mine]))
+        mine = deviations[names == name]
+        limit = _MIN_DEVIATIONS_OF_SMALL if len(mine) < _SMALL else _MIN_DEVIATIONS
+        kept[name] = len(mine) >= _MIN_PIXELS and np.median(mine) >= limit
     return kept[names]
 
 
-def _is_long(points: NDArray[np.float64]) -> bool:
-    widths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(widths[0] > _RIM_LENGTH * widths[1])
+def _rims(
+    behind: NDArray[np.bool_],
+    residuals: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    points: NDArray[np.float64],
+    beside: NDArray[np.float64],
+) -> Bool[NDArray[np.bool_], "height width"]:
+    """Return the pixels of long strips along a plane, close behind it: the sides of a table top.
+
+    ``behind`` are moving pixels behind their nearest plane, ``beside`` their distance from it (metres). What stands on
+    a plane lies in front of it, and what falls past its edge is as high as it is long.
+    """
+    result = np.zeros_like(behind)
+    number = np.full(behind.shape, -1)
+    number[behind] = np.arange(behind.sum())
+    values, numbers = _padded(residuals, np.inf), _padded(number, -1)
+    pairs = []
+    for shift in _NEIGHBOURS[:4]:
+        joined = behind & (_beside(numbers, shift) >= 0) & (_apart(values, shift) < reach)
+        pairs.append(np.stack([number[joined], _beside(numbers, shift)[joined]]))
+    ends = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(behind.sum(),) * 2)
+    count, names = connected_components(graph, directed=False)
+    places, depths, is_rim = points[behind], beside[behind], np.zeros(count, bool)
+    for name in range(count):
+        mine = names == name
+        low, high = np.percentile(places[mine], [5, 95], axis=0)
+        is_rim[name] = np.linalg.norm(high - low) > _RIM_LENGTH * np.percentile(depths[mine], 90)
+    result[behind] = is_rim[names]
+    return result
 
 
 def _not_zero(values: NDArray[np.float64]) -> NDArray[np.float64]:
