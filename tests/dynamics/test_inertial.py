@@ -34,6 +34,7 @@ SETTINGS = {
     "mirror_hidden": True,
     "is_soft": False,
     "max_friction": None,
+    "infers_guided": False,
     "rest_share": 0.05,
     "keep_shape": True,
     "carry_memory": True,

@@ -43,6 +43,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "guess_hidden": False,
         "has_driven": False,
         "max_friction": None,
+        "infers_guided": False,
         "edge_reach": None,
         "workspace_min": None,
         "workspace_max": None,

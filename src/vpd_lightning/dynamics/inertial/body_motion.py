@@ -37,6 +37,15 @@ class BodyMotion:
             strains=self.strains + change.strains,
         )
 
+    def towards(self, other: "BodyMotion", share: Float[Tensor, "batch body 1"]) -> "BodyMotion":
+        """Return this motion with so much of another."""
+        return replace(
+            self,
+            displacements=torch.lerp(self.displacements, other.displacements, share),
+            spins=torch.lerp(self.spins, other.spins, share),
+            strains=torch.lerp(self.strains, other.strains, share[..., None]),
+        )
+
     def first(self, count: int) -> "BodyMotion":
         """Return the motion of the first bodies."""
         return BodyMotion(*(getattr(self, item.name)[:, :count] for item in fields(self)))

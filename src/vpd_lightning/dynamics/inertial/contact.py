@@ -24,6 +24,10 @@ class Resolved:
         """Return that of the first bodies."""
         return Resolved(self.step.first(count), self.onward.first(count), self.touching[:, :count])
 
+    def guided(self, before: BodyMotion, share: Float[Tensor, "batch body 1"]) -> "Resolved":
+        """Return it with that share of the motion ``before``, which goes on whatever acted on it."""
+        return replace(self, step=self.step.towards(before, share), onward=self.onward.towards(before, share))
+
 
 @dataclass(frozen=True)
 class _Touch:

@@ -74,7 +74,7 @@ def resolved_contacts(
 ) -> Resolved:
     """Return the step after contact of bodies with what stands still, each other and what is driven.
 
-    What is driven is left out of the result. With ``num_substeps`` it is resolved in so many parts
+    What is driven is left out of the result, and what is guided goes on as it came (``GuidanceNetwork``). With ``num_substeps`` it is resolved in so many parts
     (``SubstepSolver``), else at once in ``num_iterations``.
     """
     motion, inertia, points, contacts = step.motion, step.inertia, step.points, step.contacts
@@ -112,8 +112,10 @@ def resolved_contacts(
     else:
         resolved = solver.resolve(motion, contacts, between, num_iterations=num_iterations, max_depth=max_depth)
     if met is not None:
-        return resolved.first(num_bodies)
-    if driven_friction is None:
+        resolved = resolved.first(num_bodies)
+    if memory.guided is not None:
+        resolved = resolved.guided(memory.motion, memory.guided)
+    if met is not None or driven_friction is None:
         return resolved
     # Nothing was touched: a gradient of zero all the same, because on several devices each weight must have one.
     displacements = resolved.step.displacements + 0 * driven_friction

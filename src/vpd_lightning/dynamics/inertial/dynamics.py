@@ -26,7 +26,7 @@ from vpd_lightning.dynamics.inertial.first_motion import (
 )
 from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity
 from vpd_lightning.dynamics.inertial.hidden_side import HiddenGuess, hidden_after
-from vpd_lightning.dynamics.inertial.materials import MaterialNetwork, elastic
+from vpd_lightning.dynamics.inertial.materials import GuidanceNetwork, MaterialNetwork, elastic
 from vpd_lightning.dynamics.inertial.memory import InertialMemory
 from vpd_lightning.dynamics.inertial.resting import held, is_slow, members_in_use, rested
 from vpd_lightning.dynamics.inertial.rigid_motion import equidistant_centers, rotate, rotation_from_spin
@@ -66,6 +66,7 @@ class InertialDynamics(AbstractDynamics):
     With ``has_driven``, driven points are rigid parts of infinite mass that push bodies, with a friction of their own
     that is learned (``driven_bodies``); nothing pushes them.
 
+    With ``infers_guided`` features tell, too, what an unseen hand moves (``GuidanceNetwork``).
     With ``edge_reach`` (spacings of the static particles) a static surface ends that far beside its last particle, at a
     seen edge (``surface_edges``) with it, and goes on under bodies; null: it goes on without end, as it does beyond the
     sides of the workspace that cut it. A body that approaches the surface under it by less than ``supported_speed``
@@ -114,6 +115,7 @@ class InertialDynamics(AbstractDynamics):
         mirror_hidden: bool,
         is_soft: bool,
         max_friction: float | None,
+        infers_guided: bool,
         rest_share: float,
         keep_shape: bool,
         carry_memory: bool,
@@ -170,13 +172,11 @@ class InertialDynamics(AbstractDynamics):
         is_guessing = guess_hidden and keep_shape and carry_memory
         self.hidden_guess = HiddenGuess(feature_dim=feature_dim) if is_guessing else None
         self.edge_reach, self.supported_speed, self.skip_resting = edge_reach, supported_speed, skip_resting
-        self.round_contact = round_contact
         self.workspace = None if workspace_min is None or workspace_max is None else (workspace_min, workspace_max)
-        self.has_driven = has_driven
+        self.round_contact, self.has_driven = round_contact, has_driven
         self.log_driven_friction = nn.Parameter(torch.tensor(math.log(0.3))) if has_driven else None
-        self.static_shading = None
-        if shadow_scales is not None:
-            self.static_shading = StaticShading(feature_dim=feature_dim, hidden_dim=hidden_dim, scales=shadow_scales)
+        self.static_shading = None if shadow_scales is None else StaticShading(**sizes, scales=shadow_scales)
+        self.guidance = GuidanceNetwork(**sizes) if infers_guided else None
 
     def initialize(self, previous: Particles, current: Particles, keys: RandomKeys) -> InertialMemory:
         """Divide what may move into bodies, and estimate their first velocities."""
@@ -209,6 +209,8 @@ class InertialDynamics(AbstractDynamics):
             )  # fmt: skip
             spacing = point_spacing(seen.positions, mask)
         materials = self.materials(seen.features, shares)
+        masses = materials.density * body_volumes(seen.positions, centers, shares)
+        guided = None if self.guidance is None else self.guidance(seen.features, shares)
         hidden = None
         if self.hidden_guess is not None:
             hidden = self.hidden_guess(seen, bodies, found.own, centers, mirrored, self.moving_shading)
@@ -222,7 +224,8 @@ class InertialDynamics(AbstractDynamics):
             own=found.own,
             motion=arriving_motion(seen.positions, found.matched.displacements, shares, centers),
             materials=materials,
-            masses=materials.density * body_volumes(seen.positions, centers, shares),
+            masses=masses if guided is None else masses / (1 - guided).clamp(min=1e-3),
+            guided=guided,
             spacing=spacing,
             normals=seen.normals,
             velocities=found.matched.displacements,
@@ -390,9 +393,8 @@ class InertialDynamics(AbstractDynamics):
         """Features are the observed ones plus what turned and what moved since; nothing accumulates."""
         moving, static = memory.first_features, memory.static_features
         moving = moving + (self.moving_shading(moving, turned) - memory.first_shade)
-        if self.static_shading is None:
-            return put(current.features, memory.index, moving, memory.mask)
-        shade = self.static_shading(static, static_positions, following, memory.mask)
-        static = static + (shade - memory.static_shade)
         features = put(current.features, memory.index, moving, memory.mask)
-        return put(features, memory.static_index, static, memory.static_mask)
+        if self.static_shading is None:
+            return features
+        shade = self.static_shading(static, static_positions, following, memory.mask)
+        return put(features, memory.static_index, static + (shade - memory.static_shade), memory.static_mask)

@@ -81,6 +81,33 @@ class MaterialNetwork(nn.Module):
         )
 
 
+_FIRST_GUIDED = 0.05
+
+
+class GuidanceNetwork(nn.Module):
+    """How much of a body's motion goes on whatever acts on it, inferred from its features: 0 to 1.
+
+    A hand or a robot moves it, which no force between bodies explains: it goes on as it came, does not fall, and what
+    it meets gives way. Before training that is 0.05 for all bodies.
+    """
+
+    def __init__(self, *, feature_dim: int, hidden_dim: int):
+        super().__init__()
+        self.network = nn.Sequential(
+            nn.LayerNorm(feature_dim), nn.Linear(feature_dim, hidden_dim), nn.SiLU(), nn.Linear(hidden_dim, 1)
+        )
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.constant_(last.bias, _logit(_FIRST_GUIDED) / _GAIN)
+
+    def forward(
+        self, features: Float[Tensor, "batch particle feature"], weights: Float[Tensor, "batch body particle"]
+    ) -> Float[Tensor, "batch body 1"]:
+        """Return the shares; ``weights`` sum to one over the particles of a body."""
+        return torch.sigmoid(_GAIN * self.network(torch.einsum("bkp,bpf->bkf", weights, features)))
+
+
 def elastic(motion: BodyMotion, materials: Materials) -> Float[Tensor, "batch body 3 3"]:
     """Return the strains of a damped oscillation about the first shape; one semi-implicit step, stable for any."""
     eye = torch.eye(3, dtype=motion.strains.dtype, device=motion.strains.device)

@@ -23,6 +23,7 @@ class InertialMemory:
     motion: BodyMotion  # the velocity with which bodies go into the next step
     materials: Materials
     masses: Float[Tensor, "batch body 1"]
+    guided: Float[Tensor, "batch body 1"] | None  # share of its motion that goes on whatever acts on it
     spacing: Float[Tensor, " batch"]  # of the moving candidates (metres)
     normals: Float[Tensor, "batch moving 3"]
     velocities: Float[Tensor, "batch moving 3"]  # metres a step; used with keep_shape=false only
