@@ -305,7 +305,7 @@ class InertialDynamics(AbstractDynamics):
             driven = driven_bodies(current.driven, memory.origin)
         resolved = self._resolved(positions, static_positions, memory, driven)
         resting = self.rest_share * self.force_scale, _ARM * self.contact_range
-        step, onward = rested(resolved, *resting)
+        step, onward = rested(resolved, *resting, memory.guided)
         own = memory.own
         moved = step.carried(positions, own)
         velocities = memory.velocities

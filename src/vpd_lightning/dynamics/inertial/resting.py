@@ -35,11 +35,13 @@ def held(motion: BodyMotion, undisturbed: Bool[Tensor, "batch body"]) -> BodyMot
     )
 
 
-def rested(resolved: Resolved, slowest: float, arm: float) -> tuple[BodyMotion, BodyMotion]:
+def rested(
+    resolved: Resolved, slowest: float, arm: float, guided: Float[Tensor, "batch body 1"] | None
+) -> tuple[BodyMotion, BodyMotion]:
     """Stop bodies in contact that move by less than ``slowest`` in a step (metres; a rotation counts at ``arm``).
 
     Networks are never exactly zero, and a body at rest would creep; like static friction, this suppresses small
-    motion.
+    motion, but for the share of it that is ``guided``.
     """
     if slowest == 0:
         return resolved.step, resolved.onward
@@ -48,6 +50,8 @@ def rested(resolved: Resolved, slowest: float, arm: float) -> tuple[BodyMotion, 
         square = motion.displacements.square().sum(dim=-1, keepdim=True)
         square = square + arm**2 * motion.spins.square().sum(dim=-1, keepdim=True)
         share = torch.where(resolved.touching, square / (square + slowest**2), 1.0)
+        if guided is not None:
+            share = share + guided * (1 - share)
         gated.append(replace(motion, displacements=motion.displacements * share, spins=motion.spins * share))
     return gated[0], gated[1]
 
