@@ -2,8 +2,8 @@
 
 import torch
 
-from tests.dynamics.test_inertial import dynamics, fall, roll, scene
 from tests.dynamics.solids import cube
+from tests.dynamics.test_inertial import dynamics, fall, roll, scene
 from vpd_lightning.types import Particles
 
 SPEED = torch.tensor([0.02, 0.0, 0.0], dtype=torch.float64)  # metres per step
@@ -30,7 +30,7 @@ def two_cubes() -> tuple[Particles, Particles]:
 
 def rolled(share: float | None, num_steps: int = 12) -> torch.Tensor:
     """Return the way of both cubes' centres (step, cube, 3) where the yellow one is guided by so much."""
-    model = fall(dynamics(infers_guided=share is not None))
+    model = fall(dynamics(infers_guided=share is not None, num_probes=600, num_contact_substeps=4))
     if share is not None:
         set_guided(model, share)
     previous, current = two_cubes()
