@@ -51,7 +51,8 @@ def small_simulator() -> Simulator:
             num_candidates=16, surface_scale=0.3, kernel_scales=[0.15, 0.4, 1.0], layer_depth=1.0, near=NEAR, far=FAR,
             ray_chunk_size=2048, candidate_backend="auto",
             facing_softness=None, has_scenery=False, num_scenery_candidates=12, elliptic_footprints=True,
-            far_pixels=False, seen_through=False, unseen_ground=False, num_lights=0, num_occluders=9, shadow_softness=0.5,
+            far_pixels=False, seen_through=False,
+            unseen_ground=False, num_lights=0, num_occluders=9, shadow_softness=0.5,
         ),
         location_noise=0.0, checkpoint_dynamics=False, pixel_gradient_to_motion=1.0,
     )  # fmt: skip

@@ -88,10 +88,8 @@ def plain_ray(points, origin, direction, width, angle, elliptic, seen_through):
     apart = [beside / reach for _, beside, _, reach in usable]
     closest = min(one + turn / 0.2**2 for one, turn in zip(apart, turns, strict=True))
     meets = [not seen_through or one < closest + 0.3 for one in apart]
-    first = min(
-        (met + 2 * max(beside - most * reach, 0.0) for (_, beside, met, reach), does in zip(usable, meets) if does),
-        default=math.inf,
-    )
+    reached = [met + 2 * max(beside - most * reach, 0.0) for _, beside, met, reach in usable]
+    first = min((met for met, does in zip(reached, meets, strict=True) if does), default=math.inf)
     logs = []
     for (point, beside, met, _), does, turn in zip(usable, meets, turns, strict=True):
         if not does and met <= first - 3 * point["size"]:

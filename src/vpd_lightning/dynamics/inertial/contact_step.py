@@ -74,8 +74,8 @@ def resolved_contacts(
 ) -> Resolved:
     """Return the step after contact of bodies with what stands still, each other and what is driven.
 
-    What is driven is left out of the result, and what is guided goes on as it came (``GuidanceNetwork``). With ``num_substeps`` it is resolved in so many parts
-    (``SubstepSolver``), else at once in ``num_iterations``.
+    What is driven is left out of the result, and what is guided goes on as it came (``GuidanceNetwork``). With
+    ``num_substeps`` it is resolved in so many parts (``SubstepSolver``), else at once in ``num_iterations``.
     """
     motion, inertia, points, contacts = step.motion, step.inertia, step.points, step.contacts
     before = memory.motion
