@@ -4,13 +4,14 @@
 in the folder are generated without a sensor (those that are not there are left out); its errors are added here, from
 one seed. All measured pixels in the
 workspace are judged against the true segmentation, all views and frames of a cell together: flying pixels and holes
-count as they are. ``--plain`` measures the way that takes depth for true, whatever the noise.
+count as they are. ``--plain`` measures the way that takes depth for true, whatever the noise. ``--join before=FILE,...
+after=FILE,...`` puts what was measured into one file, with the worst of all scenes for each size, sensor and noise.
 """
 
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,12 @@ def measure_cell(
 
 
 def measure(
-    root: Path, scenes: Sequence[str], sizes: Sequence[int], times: Sequence[int], is_plain: bool
+    root: Path,
+    scenes: Sequence[str],
+    sizes: Sequence[int],
+    times: Sequence[int],
+    percents: Sequence[float],
+    is_plain: bool,
 ) -> dict[str, Any]:
     """Return one entry for each scene, size, sensor and percentage of noise at the median depth."""
     cells: dict[str, Any] = {}
@@ -90,11 +96,34 @@ def measure(
                 print(f"{scene}_{size} is not there: left out")
                 continue
             for sensor in SENSORS:
-                for percent in PERCENTS:
+                for percent in percents:
                     name = f"{scene}/{size}/{sensor}/{percent:g}"
                     cells[name] = measure_cell(root / f"{scene}_{size}", encoder, sensor, percent, times)
                     print(name, {key: round(value, 3) for key, value in cells[name].items()}, flush=True)
     return {"times": list(times), "split": "test", "cells": cells}
+
+
+def worst(cells: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the lowest precision and recall of all scenes, by ``SIZE/SENSOR/PERCENT``."""
+    groups: dict[str, dict[str, Any]] = {}
+    for name, cell in cells.items():
+        group = groups.setdefault(name.partition("/")[2], {"precision": 1.0, "recall": 1.0, "scenes": 0})
+        group["scenes"] += 1
+        for score in ("precision", "recall"):
+            group[score] = min(group[score], cell[score])
+    return groups
+
+
+def joined(words: Sequence[str]) -> dict[str, Any]:
+    """Return what was measured in several runs: ``NAME=FILE,FILE`` puts the cells of the files under a name."""
+    result: dict[str, Any] = {"worst": {}}
+    for word in words:
+        name, _, files = word.partition("=")
+        found = [json.loads(Path(file).read_text()) for file in files.split(",")]
+        result |= {"times": found[0]["times"], "split": found[0]["split"]}
+        result[name] = {cell: values for one in found for cell, values in one["cells"].items()}
+        result["worst"][name] = worst(result[name])
+    return result
 
 
 def main() -> None:
@@ -104,11 +133,14 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=SCENES)
     parser.add_argument("--sizes", nargs="+", type=int, default=[64, 128])
     parser.add_argument("--times", nargs="+", type=int, default=[0, 10, 20], help="frames")
+    parser.add_argument("--percents", nargs="+", type=float, default=PERCENTS, help="noise at the median depth")
     parser.add_argument("--plain", action="store_true", help="take depth for true")
     parser.add_argument("--out", type=Path, default=Path("runs/what_may_move.json"))
+    parser.add_argument("--join", nargs="+", metavar="NAME=FILE,...", help="measure nothing, but join these")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    result = measure(given.root, given.scenes, given.sizes, given.times, given.plain)
+    measured = (given.root, given.scenes, given.sizes, given.times, given.percents, given.plain)
+    result = joined(given.join) if given.join else measure(*measured)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps(result, indent=1) + "\n")
 
