@@ -64,8 +64,8 @@ class SceneryLayer(nn.Module):
     pixel is an ellipse on its plane (as in EWA splatting, Zwicker et al. 2001); where not ``elliptic`` it is a disc as
     wide as that ellipse is long. With ``seen_through`` a surface ends where a camera saw past it: a ray that passes a
     point of what is behind more closely, and along the way it was seen, does not meet what reaches beside that. With
-    ``far_pixels`` a ray also sees, behind the points, the pixels that measured no
-    distance, in whose direction it leads.
+    ``far_pixels`` a ray also sees, behind the points, the pixels that measured no distance, in whose direction it
+    leads.
     """
 
     def __init__(

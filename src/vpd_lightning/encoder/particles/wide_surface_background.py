@@ -72,6 +72,7 @@ class WideSurfaceBackground(AbstractBackground):
         self.noise_floor = noise_floor
         self._memory: OrderedDict[bytes, np.ndarray] = OrderedDict()
         self._trusted: OrderedDict[bytes, np.ndarray] = OrderedDict()
+        self._in_the_air: OrderedDict[bytes, np.ndarray] = OrderedDict()
         self._restored: OrderedDict[bytes, np.ndarray | None] = OrderedDict()  # None: as measured
 
     @torch.no_grad()
@@ -93,15 +94,15 @@ class WideSurfaceBackground(AbstractBackground):
             return frames.depth, frames.depth
         members = [frames[member] for member in range(len(frames.depth))]
         placed = torch.stack([self._restored_member(member) for member in members])
-        hanging = torch.stack([self._hanging(member) for member in members]).to(placed.device)
+        hanging = torch.stack([self._remembered(self._in_the_air, member, self._hanging) for member in members])
         measured = torch.isfinite(frames.depth) & (frames.depth > 0)
-        return torch.where(measured & ~hanging, frames.depth, placed), placed
+        return torch.where(measured & ~hanging.to(placed.device), frames.depth, placed), placed
 
-    def _hanging(self, frames: RGBDFrames) -> Bool[Tensor, "view height width"]:
-        depth, _, noise = self._measured(frames.to("cpu", torch.float32))
+    def _hanging(self, frames: RGBDFrames) -> np.ndarray:
+        depth, valid, noise = self._measured(frames.to("cpu", torch.float32))
         if noise is None:
-            return torch.zeros_like(depth, dtype=torch.bool)
-        return between_surfaces(depth, torch.from_numpy(noise), torch.from_numpy(_pixel_sizes(frames)))
+            return np.zeros_like(valid)
+        return between_surfaces(depth, torch.from_numpy(noise), torch.from_numpy(_pixel_sizes(frames))).numpy()
 
     def _restored_member(self, frames: RGBDFrames) -> Float[Tensor, "view height width"]:
         key, memory = _digest(frames, frames.rgb), self._restored
