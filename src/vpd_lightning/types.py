@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from vpd_lightning.errors import NonFiniteError
+from vpd_lightning.finite import is_traced
 from vpd_lightning.randomness import RandomKeys
 
 NUM_CONTEXT_FRAMES = 2
 """Observed frames that a model of particles starts from: two give each particle a position and a velocity."""
 
-OTHER_AXES = ("scenery", "occluders", "hidden_side", "driven")
+OTHER_AXES = ("scenery", "occluders", "hidden_side", "driven", "pictures")
 """Fields of particles that have an axis of their own in place of that of the particles."""
 
 Border = TypeVar("Border", bound="_Border")
@@ -228,6 +228,15 @@ class HiddenSide(_Border):
 
 
 @dataclass(frozen=True)
+class Pictures(_Border):
+    """The images (in [0, 1]) in which particles were observed, with the depth that placed them (metres; 0: none)."""
+
+    rgb: Float[Tensor, "*shape height width 3"]
+    depth: Float[Tensor, "*shape height width"]
+    cameras: Cameras
+
+
+@dataclass(frozen=True)
 class Particles(_Border):
     """Latent particles, dense and padded; ``mask`` is false for padding. The batch axis may be absent.
 
@@ -236,7 +245,8 @@ class Particles(_Border):
     particles that are not ``moving`` are for the dynamics alone: a renderer draws the scenery in their place.
     ``occluders`` cast the shadows in place of moving particles: in training, what was seen to move at that time.
     ``hidden_side`` is what a dynamics guesses of them beyond what was seen. ``driven`` are points whose motion is
-    given, such as a robot's; they are no particles and have an axis of their own.
+    given, such as a robot's; they are no particles and have an axis of their own. ``pixels`` says which pixel of
+    ``pictures`` a particle is (counted over ``view height width``; -1: none, it was put or moved there by hand).
     """
 
     positions: Float[Tensor, "*batch particle 3"]
@@ -249,6 +259,8 @@ class Particles(_Border):
     occluders: Occluders | None = None
     hidden_side: HiddenSide | None = None
     driven: Driven | None = None
+    pixels: Int[Tensor, "*batch particle"] | None = None
+    pictures: Pictures | None = None
 
     def __post_init__(self) -> None:
         if self.mask is None:
@@ -260,7 +272,7 @@ class Particles(_Border):
         return self.positions.shape[-2]
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> "Particles":
-        """Apply a function to every tensor with a particle axis; scenery, occluders, hidden side and driven stay."""
+        """Apply a function to every tensor with a particle axis; what has other axes stays."""
         names = [item.name for item in fields(self) if item.name not in OTHER_AXES]
         known = {name: value for name in names if (value := getattr(self, name)) is not None}
         return replace(self, **{name: function(value) for name, value in known.items()})
@@ -297,31 +309,6 @@ class Particles(_Border):
         names = ("positions", "features", "colors", "normals")
         known = {name: value for name in names if (value := getattr(self, name)) is not None}
         return replace(self, **{name: torch.where(self.mask[..., None], value, 0.0) for name, value in known.items()})
-
-
-def require_finite(where: str, **inputs: Tensor) -> None:
-    """Refuse NaN and infinity by the name of the input.
-
-    That waits for the device, so it is left out where a compiler or a CUDA graph records; NaN then comes out as NaN.
-
-    Raises:
-        NonFiniteError: naming every input that is not finite.
-    """
-    if is_traced():
-        return
-    finite = torch.stack([torch.isfinite(tensor).all() for tensor in inputs.values()])
-    if bool(finite.all()):
-        return
-    bad = [name for name, is_finite in zip(inputs, finite.tolist(), strict=True) if not is_finite]
-    raise NonFiniteError(
-        f"{where}: NaN or infinity in {' and '.join(bad)}.\n"
-        "The model diverged or the data are damaged: lower the learning rate, or check with vpd-data validate."
-    )
-
-
-def is_traced() -> bool:
-    """Whether what runs is being recorded, so that no number may be looked at."""
-    return torch.compiler.is_compiling() or (torch.cuda.is_available() and torch.cuda.is_current_stream_capturing())
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ SETTINGS = {
     "num_plane_rounds": 3,
     "tangential_weight": 0.05,
     "rest_weight": 0.03,
+    "picture_weight": 0.15,
 }
 
 
@@ -370,6 +371,7 @@ def test_a_shift_of_either_frame_shifts_the_motion_by_as_much_in_its_gradient():
         {"num_plane_rounds": 0},
         {"tangential_weight": 0.0},
         {"rest_weight": float("nan")},
+        {"picture_weight": -0.1},
     ],
 )
 def test_wrong_settings_are_refused(changes):

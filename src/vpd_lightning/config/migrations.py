@@ -77,6 +77,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "load_driven": False,
     },
     "vpd_lightning.encoder.particles.wide_surface_background.WideSurfaceBackground": {"noise_floor": 0.001},
+    f"{_DYNAMICS}inertial.first_velocity.FirstVelocity": {"picture_weight": 0.0},
     "vpd_lightning.encoder.unet.UNetEncoder": {
         "color_features": False,
         "same_pixels": False,

@@ -8,9 +8,10 @@ from torch import nn
 
 from vpd_lightning.dynamics.base import AbstractDynamics
 from vpd_lightning.dynamics.blocks import MLP
+from vpd_lightning.finite import require_finite
 from vpd_lightning.graph.pooling import mean_features
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles, require_finite
+from vpd_lightning.types import Particles
 
 
 class GlobalMLPDynamics(AbstractDynamics):

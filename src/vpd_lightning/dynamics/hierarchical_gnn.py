@@ -17,12 +17,13 @@ from vpd_lightning.dynamics.blocks import MLP, EdgeUpdater, NodeUpdater
 from vpd_lightning.dynamics.delayed_faults import DelayedFaults
 from vpd_lightning.dynamics.graph_inputs import driven_of, driven_tensors, rows_in_use, usable
 from vpd_lightning.errors import ConfigError
+from vpd_lightning.finite import require_finite
 from vpd_lightning.graph.hierarchical import EdgeSet, HierarchicalGraph, build_graph, draw_priorities
 from vpd_lightning.graph.incidence import Incidence, gather_to_edges
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.graph.static_graph import build_static_graph
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Driven, Particles, require_finite
+from vpd_lightning.types import Driven, Particles
 
 
 class HierarchicalGNNDynamics(AbstractDynamics):

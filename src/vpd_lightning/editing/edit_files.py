@@ -127,7 +127,7 @@ def save_scene(path: str | Path, scene: Scene) -> None:
         particles = getattr(scene, frame)
         for item in fields(particles):
             value = getattr(particles, item.name)
-            if isinstance(value, Tensor):
+            if isinstance(value, Tensor) and item.name != "pixels":  # of pictures, which are not written
                 arrays[f"{frame}_{item.name}"] = value.detach().cpu().numpy()
         if (scenery := particles.scenery) is not None:
             for item in fields(scenery):

@@ -13,7 +13,7 @@ from vpd_lightning.editing.point_particles import particles_of_points
 from vpd_lightning.editing.rotation import NO_ROTATION, Numbers, Quaternion, matrix_of, quaternion_of, vector_of
 from vpd_lightning.editing.scenery import without_scenery
 from vpd_lightning.editing.selectors import Everything, Selector
-from vpd_lightning.editing.state import EditState, chosen_slots, joined, start_state, transformed
+from vpd_lightning.editing.state import EditState, chosen_slots, joined, start_state, transformed, without_pixels
 from vpd_lightning.errors import EditError
 from vpd_lightning.simulator import Scene
 from vpd_lightning.types import Particles
@@ -220,7 +220,8 @@ class SetVelocity(Operation):
         previous = state.scene.previous
         kept = _without(previous, before)
         origin = torch.cat([state.origin, now.nonzero().flatten()])
-        return replace(state, scene=Scene(joined(kept, chosen_slots(moved, now)), current), origin=origin)
+        scene = Scene(joined(kept, chosen_slots(moved, now)), without_pixels(current, now))
+        return replace(state, scene=scene, origin=origin)
 
 
 def _without(particles: Particles, chosen: Bool[Tensor, " particle"]) -> Particles:

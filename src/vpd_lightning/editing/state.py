@@ -91,7 +91,9 @@ def joined(first: Particles, second: Particles) -> Particles:
     if first.scenery is not None and second.scenery is None and bool(stands_still.any()):
         raise EditError("Only one of the two scenes has scenery.\nEncode both with the same model.")
     scenery = joined_scenery(first.scenery, second.scenery)
-    parts: dict[str, Any] = {"scenery": scenery, "driven": first.driven}
+    pixels = None if first.pixels is None else torch.full_like(second.mask, -1, dtype=first.pixels.dtype)
+    second = replace(second, pixels=pixels)  # the first ones' pictures do not show them
+    parts: dict[str, Any] = {"scenery": scenery, "driven": first.driven, "pictures": first.pictures}
     for item in fields(first):
         if item.name in OTHER_AXES:
             continue
@@ -124,4 +126,11 @@ def transformed(
         turned = (particles.normals.double() @ rotation.T).to(particles.normals)
         changed["normals"] = torch.where(where, turned, particles.normals)
     scenery = transformed_scenery(particles, chosen, rotation, scale, about, translation)
-    return replace(particles, scenery=scenery, **changed)  # type: ignore[arg-type]
+    return replace(without_pixels(particles, chosen), scenery=scenery, **changed)  # type: ignore[arg-type]
+
+
+def without_pixels(particles: Particles, chosen: Bool[Tensor, " particle"]) -> Particles:
+    """Return a frame whose chosen particles are no longer where, or as fast as, the pictures show them."""
+    if particles.pixels is None:
+        return particles
+    return replace(particles, pixels=particles.pixels.masked_fill(chosen[None], -1))

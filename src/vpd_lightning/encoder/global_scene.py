@@ -9,8 +9,9 @@ from torch import Tensor, nn
 from vpd_lightning.encoder.base import AbstractEncoder, EncoderOutput
 from vpd_lightning.encoder.networks.resnet import ResNetTrunk
 from vpd_lightning.errors import DataError
+from vpd_lightning.finite import require_finite
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles, RGBDFrames, require_finite
+from vpd_lightning.types import Particles, RGBDFrames
 
 
 class GlobalSceneEncoder(AbstractEncoder):

@@ -84,45 +84,44 @@ def _fitted(depth: Tensor, rgb: Tensor, noise: Tensor, pixel_size: Tensor) -> Fl
     rgb, noise, pixel_size = rgb.to(depth), noise.to(depth), pixel_size.to(depth)
     around = _windows(torch.where(depth > 0, 1 / depth, 0.0)[None])[0]  # 1/m; zero where there is none
     known = around > 0
-    difference = (_windows(rgb.movedim(-1, 0)) - rgb.reshape(1, -1, 3).permute(2, 1, 0)).square().sum(dim=0)
+    colors = rgb.movedim(-1, 0)
+    difference = (_windows(colors) - colors.flatten(1)[:, None]).square().sum(dim=0)
     difference = torch.where(known, difference, torch.inf)
-    most_alike = difference.amin(dim=1, keepdim=True)
-    distance = (rows.square() + columns.square()) / (2 * _WIDTH**2)
+    most_alike = difference.amin(dim=0)
+    distance = (rows.square() + columns.square())[:, None] / (2 * _WIDTH**2)
     weights = decay(-distance - (difference - most_alike.clamp(max=1e9)) / (2 * _COLOR_SCALE**2))
 
-    own, measured = depth.flatten()[:, None], depth.flatten() > 0
-    start = torch.where(own > 0, 1 / own, 0.0)
-    start[~measured] = _median(around[~measured], weights[~measured])
+    own, measured = depth.flatten(), depth.flatten() > 0
+    start = torch.where(measured, 1 / own, 0.0)
+    start[~measured] = _median(around[:, ~measured], weights[:, ~measured])
     start = start.clamp(min=1e-30)
     values = around / start - 1  # of the inverse depth at the start, so that all that follows has its digits
     scale = (_ROBUST * noise).clamp(min=1e-6)
-    offsets = torch.stack([torch.ones_like(rows), columns, rows], dim=1)
-    products = (offsets[:, :, None] * offsets[:, None, :]).flatten(1)
+    offsets = torch.stack([torch.ones_like(rows), columns, rows], dim=0)
+    products = (offsets[:, None] * offsets).flatten(0, 1)
     pull = torch.diag(torch.tensor([1e-6, _RIDGE, _RIDGE], dtype=depth.dtype, device=depth.device))
     robust = _robust(weights, values, torch.maximum(scale, _JUMP * pixel_size))
     for _ in range(_NUM_ROUNDS):
-        matrix = (robust @ products).unflatten(1, (3, 3)) + pull
-        planes = torch.linalg.solve(matrix, (robust * values) @ offsets)
-        robust = _robust(weights, values - planes @ offsets.mT, scale)
+        matrix = (products @ robust).mT.unflatten(1, (3, 3)) + pull
+        planes = torch.linalg.solve(matrix, (offsets @ (robust * values)).mT)
+        robust = _robust(weights, values - offsets.mT @ planes.mT, scale)
 
-    nearness = start[:, 0] * (1 + planes[:, 0])
+    nearness = start * (1 + planes[:, 0])
     fitted = torch.where(nearness > 0, 1 / nearness, 0.0)
     shift = planes[:, 0].abs()
     is_fine = torch.where(
         measured,
         shift < _MAX_CORRECTION * noise,
-        (robust.sum(dim=1) > _MIN_WEIGHT)
+        (robust.sum(dim=0) > _MIN_WEIGHT)
         & (shift < 2 * torch.maximum(scale, _JUMP * pixel_size))
-        & (most_alike[:, 0] < (3 * _COLOR_SCALE) ** 2),
+        & (most_alike < (3 * _COLOR_SCALE) ** 2),
     )
-    return torch.where(is_fine, fitted, own[:, 0]).view_as(depth)
+    return torch.where(is_fine, fitted, own).view_as(depth)
 
 
-def _windows(images: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel pixel neighbour"]:
+def _windows(images: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel neighbour pixel"]:
     """Return what surrounds each pixel; zeros beyond the border."""
-    size = 2 * _REACH + 1
-    columns = torch.nn.functional.unfold(images[:, None], size, padding=_REACH)
-    return columns.transpose(1, 2).contiguous()
+    return torch.nn.functional.unfold(images[:, None], 2 * _REACH + 1, padding=_REACH)
 
 
 def _robust(weights: Tensor, residuals: Tensor, scale: Tensor) -> Tensor:
@@ -131,10 +130,10 @@ def _robust(weights: Tensor, residuals: Tensor, scale: Tensor) -> Tensor:
 
 
 def _median(
-    values: Float[Tensor, "pixel neighbour"], weights: Float[Tensor, "pixel neighbour"]
-) -> Float[Tensor, "pixel 1"]:
+    values: Float[Tensor, "neighbour pixel"], weights: Float[Tensor, "neighbour pixel"]
+) -> Float[Tensor, " pixel"]:
     """Return the weighted median over neighbours."""
-    ordered, order = values.sort(dim=1)
-    sums = torch.gather(weights, 1, order).cumsum(dim=1)
-    middle = (sums >= sums[:, -1:] / 2).to(torch.uint8).argmax(dim=1, keepdim=True)
-    return torch.gather(ordered, 1, middle)
+    ordered, order = values.sort(dim=0)
+    sums = torch.gather(weights, 0, order).cumsum(dim=0)
+    middle = (sums >= sums[-1] / 2).to(torch.uint8).argmax(dim=0, keepdim=True)
+    return torch.gather(ordered, 0, middle)[0]

@@ -280,8 +280,11 @@ def hangs_alone(
     """
     found, alone = points[valid], np.zeros_like(valid)
     if len(found):
-        counts = cKDTree(found).query_ball_point(found, _SUPPORT_REACH * footprints[valid], return_length=True)
-        alone[valid] = counts <= _MIN_SUPPORT  # itself among them
+        reach = _SUPPORT_REACH * footprints[valid]
+        # Itself among them, so many lie within reach unless the next one does not: to count all takes thrice as long.
+        tree = cKDTree(found, balanced_tree=False)
+        distance, _ = tree.query(found, k=[_MIN_SUPPORT + 1], distance_upper_bound=np.nextafter(reach.max(), np.inf))
+        alone[valid] = distance[:, 0] > reach
     return alone
 
 

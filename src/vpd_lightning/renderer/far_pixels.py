@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vpd_lightning.finite import is_traced
 from vpd_lightning.geometry.decay import decay
 from vpd_lightning.renderer.kernels.ray_search import RaySearch
 from vpd_lightning.renderer.rays.ray_scores import BesideRay
-from vpd_lightning.types import Rays, Scenery, is_traced
+from vpd_lightning.types import Rays, Scenery
 
 _NUM_CANDIDATES = 4
 """The pixels around a direction."""

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from vpd_lightning.finite import require_finite
 from vpd_lightning.graph.neighbors import BACKENDS
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
@@ -33,7 +34,7 @@ from vpd_lightning.renderer.rays.hierarchical_sampling import (
     points_along,
 )
 from vpd_lightning.renderer.rays.volumetric import ray_weights
-from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
+from vpd_lightning.types import Particles, Rays, RenderedRays
 
 
 class PointNeRFRenderer(AbstractRenderer):

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from vpd_lightning.finite import is_traced
 from vpd_lightning.geometry.decay import NEGLIGIBLE, decay
 from vpd_lightning.geometry.spacing import point_spacing
-from vpd_lightning.types import is_traced
 
 _PAIRS_PER_CHUNK = 2**17
 """Of points and occluders at a time: half a megabyte, which stays in cache."""

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from vpd_lightning.finite import require_finite
 from vpd_lightning.geometry.decay import decay
 from vpd_lightning.geometry.occluders import MOST_OCCLUDERS, occluders_of, thinned
 from vpd_lightning.randomness import RandomKeys
@@ -19,7 +20,7 @@ from vpd_lightning.renderer.observed_light import ObservedScenery, light_then, o
 from vpd_lightning.renderer.rays.ray_scores import BesideAndBehind
 from vpd_lightning.renderer.scenery_layer import SceneryLayer, SeenScenery
 from vpd_lightning.renderer.shadows import Shadows
-from vpd_lightning.types import Occluders, Particles, Rays, RenderedRays, Scenery, require_finite
+from vpd_lightning.types import Occluders, Particles, Rays, RenderedRays, Scenery
 
 _GROUND_LENGTH = 20.0
 """Surface scales over which the ground network resolves positions; farther out they are contracted."""

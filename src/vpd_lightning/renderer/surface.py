@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from vpd_lightning.finite import require_finite
 from vpd_lightning.randomness import RandomKeys
 from vpd_lightning.renderer.base import AbstractRenderer
 from vpd_lightning.renderer.features.feature_network import FeatureNetwork
@@ -26,7 +27,7 @@ from vpd_lightning.renderer.rays.ray_candidates import (
     ray_neighbor_features,
 )
 from vpd_lightning.renderer.rays.volumetric import composite
-from vpd_lightning.types import Particles, Rays, RenderedRays, require_finite
+from vpd_lightning.types import Particles, Rays, RenderedRays
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 

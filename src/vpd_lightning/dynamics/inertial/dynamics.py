@@ -22,6 +22,7 @@ from vpd_lightning.dynamics.inertial.first_motion import (
     movable,
     observed,
     put,
+    relative_to,
     take,
 )
 from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity
@@ -151,9 +152,9 @@ class InertialDynamics(AbstractDynamics):
         self.force_scale, self.rest_share = force_scale, rest_share
         self.contact_range, self.contact_reach = contact_range, contact_reach
         self.num_contact_iterations, self.num_contact_substeps = num_contact_iterations, num_contact_substeps
-        self.max_contact_depth = max_contact_depth
         self.mirror_hidden, self.keep_shape, self.carry_memory = mirror_hidden, keep_shape, carry_memory
-        self.first_velocity, self.extent_weight = first_velocity, extent_weight
+        self.max_contact_depth, self.extent_weight = max_contact_depth, extent_weight
+        self.first_velocity = first_velocity
         self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
         self.forces = BodyForces(
             hidden_dim=hidden_dim,
@@ -185,11 +186,10 @@ class InertialDynamics(AbstractDynamics):
             return self._first_memory(previous, current)
 
     def _first_memory(self, previous: Particles, current: Particles) -> InertialMemory:
-        # Far from the world's origin coordinates have few digits left, so everything is seen from a particle's place:
-        # differences of near ones are exact.
+        # As seen from a particle's place: far from the world's origin coordinates have few digits left.
         index, _ = gather_index(movable(current))
         origin = take(current.positions, index[:, :1]).detach()
-        previous, current = (replace(frame, positions=frame.positions - origin) for frame in (previous, current))
+        previous, current = (relative_to(frame, origin) for frame in (previous, current))
         found = find_first_motion(previous, current, first_velocity=self.first_velocity, **self.grouping)  # type: ignore[arg-type]
         index, mask, seen, bodies = found.index, found.mask, found.seen, found.bodies
         shares = bodies / bodies.sum(dim=-1, keepdim=True).clamp(min=1)
@@ -270,8 +270,8 @@ class InertialDynamics(AbstractDynamics):
         memory = self.initialize(previous, current, keys)
         assert memory.hidden is not None
         positions, centers = take(current.positions, memory.index) - memory.origin, memory.motion.centers
-        unturned = rotation_from_spin(torch.zeros_like(centers))
-        _, side = hidden_after(memory.hidden, positions, centers, unturned, self.moving_shading, memory.origin)
+        places = positions, centers, rotation_from_spin(torch.zeros_like(centers))
+        _, side = hidden_after(memory.hidden, *places, self.moving_shading, memory.origin)
         return replace(current, hidden_side=side)
 
     def forward(
@@ -280,7 +280,7 @@ class InertialDynamics(AbstractDynamics):
         """Advance one step; see the class."""
         if current.num_particles == 0:
             return current, memory
-        current = current.without_padding()
+        current = replace(current.without_padding(), pixels=None, pictures=None)  # those of what was observed
         with torch.autocast(current.positions.device.type, enabled=False):  # geometry in full precision
             if not self.carry_memory and rollout_step > 0:
                 memory = self._first_memory(*observed(previous, current))
@@ -328,8 +328,8 @@ class InertialDynamics(AbstractDynamics):
         undisturbed = memory.undisturbed & is_slow_now
         at_rest = resolved.touching.squeeze(-1) & is_slow_now | undisturbed | ~members_in_use(memory.bodies)
         shapes = rotations @ memory.shapes @ rotations.mT
-        memory = replace(memory, motion=onward, normals=turned, velocities=velocities, hidden=hidden)
-        memory = replace(memory, undisturbed=undisturbed, at_rest=at_rest, shapes=shapes)
+        moving = {"motion": onward, "normals": turned, "velocities": velocities, "hidden": hidden, "shapes": shapes}
+        memory = replace(memory, undisturbed=undisturbed, at_rest=at_rest, **moving)
         # Normals rotate with their bodies: a memory rebuilt from these particles needs those of the new pose.
         normals = put(current.normals, memory.index, turned, memory.mask)  # type: ignore[arg-type]
         return replace(current, positions=all_positions, features=features, normals=normals, hidden_side=side), memory

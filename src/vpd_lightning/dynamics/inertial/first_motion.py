@@ -8,9 +8,12 @@ from torch import Tensor
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion
 from vpd_lightning.dynamics.inertial.first_velocity import FirstVelocity, MatchedMotion, Surfels
+from vpd_lightning.dynamics.inertial.picture_match import picture_match
 from vpd_lightning.dynamics.inertial.rigid_motion import fit_twists, rotate, rotation_from_spin
+from vpd_lightning.finite import require_finite
+from vpd_lightning.geometry.spacing import point_spacing
 from vpd_lightning.graph.bodies import label_bodies
-from vpd_lightning.types import Particles, require_finite
+from vpd_lightning.types import Particles
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,9 @@ def find_first_motion(
         matched = MatchedMotion(torch.zeros_like(seen.positions), torch.zeros_like(seen.positions[..., 0]))
     else:
         before = _surfels(previous, *gather_index(movable(previous)))
-        matched = first_velocity(near, bodies, replace(before, positions=before.positions - origin))
+        frames = (relative_to(frame, origin) for frame in (previous, current))
+        pictures = picture_match(*frames, index, point_spacing(near.positions, mask))
+        matched = first_velocity(near, bodies, replace(before, positions=before.positions - origin), pictures)
     return FirstMotion(index, mask, seen, bodies, labels.clamp(min=0), matched)
 
 
@@ -97,6 +102,17 @@ def arriving_motion(positions: Tensor, displacements: Tensor, shares: Tensor, ce
         stretches=eye,
         strains=torch.zeros_like(eye),
     )
+
+
+def relative_to(particles: Particles, origin: Float[Tensor, "batch 1 3"]) -> Particles:
+    """Return the particles, and the cameras that saw them, as seen from a place near them (metres)."""
+    near = replace(particles, positions=particles.positions - origin)
+    if near.pictures is None:
+        return near
+    cameras = near.pictures.cameras
+    poses = cameras.cam_to_world.clone()
+    poses[..., :3, 3] -= origin
+    return replace(near, pictures=replace(near.pictures, cameras=replace(cameras, cam_to_world=poses)))
 
 
 def movable(particles: Particles) -> Bool[Tensor, "batch particle"]:

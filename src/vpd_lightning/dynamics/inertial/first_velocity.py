@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from vpd_lightning.dynamics.inertial.picture_match import PictureMatch, chromaticity
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rigid_fit, rotate, rotation_from_spin, weighted_sum
 from vpd_lightning.geometry.decay import decay
 from vpd_lightning.geometry.spacing import point_spacing
@@ -66,7 +67,8 @@ class FirstVelocity(nn.Module):
     ``tangential_weight``: points of two frames are never the same points, and between them a surface is known better
     than any point. How much it pulls depends on how many colours the body has: on one colour, all points match
     equally well; there a rotation that planes do not determine, such as the spin of a plain ball, is pulled to zero
-    (``rest_weight``).
+    (``rest_weight``). Where the pictures of both frames are known, each point's change of colour in them joins these
+    equations with ``picture_weight`` (see ``PictureMatch``).
 
     Colours are compared as chromaticity and, more weakly, brightness, within ``color_scale``, so that shading under
     rotation does not break a match; with a ``feature_scale``, the encoder's features, too. The last step is
@@ -84,6 +86,7 @@ class FirstVelocity(nn.Module):
         num_plane_rounds: int,
         tangential_weight: float,
         rest_weight: float,
+        picture_weight: float,
     ):
         super().__init__()
         positive = {"color_scale": color_scale, "min_scale": min_scale, "tangential_weight": tangential_weight}
@@ -92,6 +95,8 @@ class FirstVelocity(nn.Module):
         for name, value in positive.items():
             if not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}")
+        if not picture_weight >= 0:
+            raise ValueError(f"picture_weight must not be negative, got {picture_weight}")
         if not match_scales or min(match_scales) <= 0:
             raise ValueError(f"match_scales must be positive radii of a body, got {list(match_scales)}")
         if num_matched < 1 or num_plane_rounds < 1:
@@ -102,25 +107,31 @@ class FirstVelocity(nn.Module):
         self.color_scale, self.feature_scale = color_scale, feature_scale
         self.num_matched, self.num_plane_rounds = num_matched, num_plane_rounds
         self.tangential_weight, self.rest_weight = tangential_weight, rest_weight
+        self.picture_weight = picture_weight
 
     def forward(
-        self, current: Surfels, bodies: Float[Tensor, "batch body particle"], previous: Surfels
+        self,
+        current: Surfels,
+        bodies: Float[Tensor, "batch body particle"],
+        previous: Surfels,
+        pictures: PictureMatch | None = None,
     ) -> MatchedMotion:
         """Return the motion of the current particles; ``bodies`` is 1 where a particle belongs to a body, else 0.
 
         A particle of no body does not move. A body that the earlier frame does not show has no velocity and hardly any
-        confidence.
+        confidence. ``pictures`` are those in which the current particles and, one frame earlier, their bodies are seen.
         """
         some, target = current.first(self.num_matched), previous.first(2 * self.num_matched)
         members = bodies[:, :, : self.num_matched]
+        pictures = None if pictures is None or self.picture_weight == 0 else pictures.first(self.num_matched)
         cost = self.appearance_cost(some, target)
         with torch.no_grad():
             radii = body_radii(some.positions, members)
             smallest = self.min_scale * point_spacing(target.positions, target.mask)[:, None]
             poses, scales = self._anneal(some, members, target, cost, radii, smallest)
             for _ in range(self.num_plane_rounds - 1):
-                poses, _ = self._plane_round(poses, some, members, target, cost, scales, radii, smallest)
-        poses, confidences = self._plane_round(poses, some, members, target, cost, scales, radii, smallest)
+                poses, _ = self._plane_round(poses, some, members, target, cost, scales, radii, smallest, pictures)
+        poses, confidences = self._plane_round(poses, some, members, target, cost, scales, radii, smallest, pictures)
         count = members.sum(dim=2).clamp(min=1)
         confidence = (members * confidences[:, None]).sum(dim=2) / count
         known = torch.sigmoid((confidence - _NO_MATCH) / 0.02) * target.mask.any(dim=1, keepdim=True)
@@ -173,6 +184,7 @@ class FirstVelocity(nn.Module):
         scales: Tensor,
         radii: Float[Tensor, "batch body"],
         smallest: Float[Tensor, "batch 1"],
+        pictures: PictureMatch | None = None,
     ) -> tuple[Poses, Float[Tensor, "batch particle"]]:
         """Take one Gauss-Newton step of every body onto the surface seen before; also return confidences."""
         at = poses.of(some.positions, members)
@@ -206,6 +218,15 @@ class FirstVelocity(nn.Module):
         matrix = matrix + torch.einsum("bkp,bkpai,bkpaj->bkij", point_weights, along_axes, along_axes)
         right = torch.einsum("bkp,bkpi,bp->bki", plane, along_normal, off_plane)
         right = right + torch.einsum("bkp,bkpai,bpa->bki", point_weights, along_axes, matched - at)
+        if pictures is not None:
+            # A change of ``color_scale`` counts as much as a plane that is off by the smallest scale of a match. What
+            # pictures tell is taken as given: it has no gradient.
+            scale = self.picture_weight * (smallest / self.color_scale).square()
+            known, seen = pictures.equations(at.detach())
+            axes = along_axes.detach()
+            weighted = (scale[..., None] * members)[..., None, None] * axes
+            matrix = matrix + torch.einsum("bkpai,bpac,bkpcj->bkij", weighted, known, axes)
+            right = right + torch.einsum("bkpai,bpa->bki", weighted, seen)
         count = members.sum(dim=2)[..., None]
         ridge = torch.eye(6, dtype=at.dtype, device=at.device) * (1e-6 * count[..., None] + 1e-9)
         rest = self.rest_weight * (1.02 - variety)[..., None] * count
@@ -215,11 +236,6 @@ class FirstVelocity(nn.Module):
         turn = rotation_from_spin(step[..., :3] / size[..., None])
         rotations = (turn[..., None] * poses.rotations[..., None, :, :]).sum(dim=-2)
         return Poses(rotations, poses.centers, centers + step[..., 3:]), confidences
-
-
-def chromaticity(colors: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 6"]:
-    """Return what is compared of colours: shares of red, green and blue, and, more weakly, brightness."""
-    return torch.cat([colors / (colors.sum(dim=-1, keepdim=True) + 0.15), 0.3 * colors], dim=-1)
 
 
 def _half_squares(

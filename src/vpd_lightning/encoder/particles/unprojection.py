@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from vpd_lightning.encoder.base import AbstractBackground, AbstractEncoder
 from vpd_lightning.encoder.particles.scenery import scenery_of
 from vpd_lightning.errors import EmptyWorkspaceError
+from vpd_lightning.finite import require_finite
 from vpd_lightning.geometry import workspace
 from vpd_lightning.geometry.cameras import unproject
 from vpd_lightning.geometry.driven_pixels import nearest_pixels, shows_driven
@@ -17,7 +18,7 @@ from vpd_lightning.geometry.normals import depth_normals
 from vpd_lightning.geometry.occluders import occluders_of
 from vpd_lightning.geometry.workspace import inside_workspace
 from vpd_lightning.randomness import RandomKeys
-from vpd_lightning.types import Particles, RGBDFrames, require_finite
+from vpd_lightning.types import Particles, Pictures, RGBDFrames
 
 _EDGE_STEP = 0.05
 """Share of its depth by which a surface may leave its tangent plane in the outermost pixel of a picture."""
@@ -161,6 +162,8 @@ class UnprojectingEncoder(AbstractEncoder):
             moving=None if moving is None else torch.gather(moving, 1, index) & valid,
             normals=take(normals) if self.use_normals and normals is not None else None,
             driven=driven,
+            pixels=index if self.use_normals else None,
+            pictures=Pictures(frames.rgb, frames.depth.detach(), frames.cameras) if self.use_normals else None,
         )
         # That of the current frame is drawn; the frame before it has no other.
         if not self.has_scenery or purpose == "previous":

@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from vpd_lightning.finite import is_traced, require_finite
 from vpd_lightning.renderer.field.precision import at_least_float32, full_precision
 from vpd_lightning.renderer.rays.ray_scores import BesideRay, RayScore
-from vpd_lightning.types import is_traced, require_finite
 
 CANDIDATE_BACKENDS = ("auto", "torch", "numba")
 
