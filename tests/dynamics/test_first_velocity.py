@@ -23,7 +23,7 @@ SETTINGS = {
     "num_plane_rounds": 3,
     "tangential_weight": 0.05,
     "rest_weight": 0.03,
-    "picture_weight": 0.15,
+    "picture_weight": 3.0,
 }
 
 

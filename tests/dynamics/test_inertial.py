@@ -59,7 +59,7 @@ FIRST_VELOCITY = {
     "num_plane_rounds": 3,
     "tangential_weight": 0.05,
     "rest_weight": 0.03,
-    "picture_weight": 0.15,
+    "picture_weight": 3.0,
 }
 GRAVITY = 0.0245  # metres a step squared: 9.81 m/s^2 at 20 frames/s
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vpd_lightning.geometry.noisy_planes import _fit, _median, _ransac
+from vpd_lightning.geometry.noisy_planes import _fit, _median, _ransac, off_wide_planes
 
 
 @pytest.mark.parametrize("count", [1, 2, 20, 21, 700])
@@ -42,3 +42,40 @@ def test_the_plane_with_most_support_is_found_wherever_the_world_lies(offset: fl
 
     assert abs(plane[2]) > 0.999
     assert plane[:3] @ np.full(3, offset) == pytest.approx(plane[3], abs=0.01)
+
+
+def _table_scene(table_half: float, noise: float = 0.003) -> tuple[np.ndarray, ...]:
+    """A box on a table before rubble far behind it: depth, rays, centre, and which pixels show the box."""
+    height, width = 96, 128
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    rays = np.stack([(columns - 64) / 100, (rows - 48) / 100, np.ones((height, width))], axis=-1)
+    draw = np.random.default_rng(0)
+    depth = draw.uniform(2.3, 3.3, (height, width))  # no plane
+    depth[draw.uniform(size=depth.shape) > 0.2] = 0
+    # The table lies 0.5 m below the camera, from 1 m away on; y goes down.
+    with np.errstate(divide="ignore"):
+        down = np.where(rays[..., 1] > 0, 0.5 / rays[..., 1], np.inf)
+    on_table = (down > 1.0) & (down < 1.0 + 2 * table_half) & (np.abs(rays[..., 0] * down) < table_half)
+    depth = np.where(on_table, down, depth)
+    box = (np.abs(rays[..., 0]) < 0.08) & (np.abs(rays[..., 1] - 0.3) < 0.06)
+    depth = np.where(box, 1.3, depth)
+    return depth * (1 + noise * draw.normal(size=depth.shape)), rays, np.zeros((1, 3)), box, on_table & ~box
+
+
+def _masks(table_half: float) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
+    depth, rays, centers, box, table = _table_scene(table_half)
+    sizes, noise = np.array([0.01]), np.array([0.003])
+    valid = depth[None] > 0
+    found = off_wide_planes(depth[None], rays[None], centers, valid, noise, sizes, min_width=0.4)
+    return (None if found is None else found[0]), box, table
+
+
+def test_a_table_stands_still_although_much_more_is_seen_behind_it() -> None:
+    found, box, table = _masks(0.6)
+    assert found is not None and table.mean() > 0.1
+    assert found[box].mean() > 0.95 and found[table].mean() < 0.02
+
+
+def test_a_plane_that_is_small_may_move_however_near_it_is() -> None:
+    found, _, table = _masks(0.25)
+    assert table.mean() > 0.05 and found is not None and found[table].mean() > 0.95

@@ -5,7 +5,8 @@ the root mean square error of the particles' velocity over the root mean square 
 is the same for the true centres of the bodies, moved as the particles seen of them are said to move. Particles that
 belong to no true body, by less than ``MARGIN``, are not judged; how many of those said to move are such is ``stray``,
 and how many particles of true bodies are said to stand still is ``missed``. *Zero* errs by 100 %. ``no colours``
-matches places alone, ``unfinished`` leaves out the tangent planes, ``one body`` takes all that may move for one body.
+matches places alone, ``unfinished`` leaves out the tangent planes, ``no pictures`` what the images tell besides their
+particles' colours, ``one body`` takes all that may move for one body.
 """
 
 import argparse
@@ -40,6 +41,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "as it is": {},
     "no colours": {"color_scale": 1e3},
     "unfinished": {"num_plane_rounds": 1, "tangential_weight": 1e3},
+    "no pictures": {"picture_weight": 0.0},
     "one body": {},
 }
 MARGIN = {"deformable": 0.1}  # metres around a true body; soft bodies are drawn 2 cm outside of their mesh

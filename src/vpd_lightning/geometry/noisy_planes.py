@@ -27,6 +27,9 @@ _INLIER = 2.5
 _MIN_SHARE = 0.03
 """Share of all points that a plane must hold."""
 
+_LARGE_SHARE, _LARGE_WIDTH = 0.1, 0.6
+"""Share of all points with which a plane need reach this share of ``min_width`` only: a table before a far wall."""
+
 _NUM_BINS, _MIN_IN_BIN = 24, 20
 """Bins of distance in which bias and noise of a plane are estimated, and the fewest pixels for an estimate."""
 
@@ -118,7 +121,7 @@ def off_wide_planes(
     """Return which valid pixels lie on no wide plane; None where no wide plane is found.
 
     Planes are fitted by RANSAC to the points of all views together; one counts where it holds many points and reaches
-    ``min_width`` of the diagonal of all that is seen. For each plane, view and distance its bias and noise are found
+    ``min_width`` of the diagonal of all that is seen (less where it holds a tenth of all points). For each plane, view and distance its bias and noise are found
     anew: at grazing angles a sensor errs by more than it scatters. How many standard deviations a pixel lies off its
     nearest plane, and the labels of its neighbours (mean field of a Potts model), decide. ``rays`` are one unit along
     the optical axis, in the world; ``noise`` is a share of depth (``relative_noise``), and so is ``pixel_sizes``,
@@ -172,7 +175,8 @@ def _wide_planes(views: _Views, noise: NDArray[np.float64], min_width: float) ->
         if inside.sum() < _MIN_SHARE * len(points):
             break
         low, high = np.percentile(left[inside], [2, 98], axis=0)
-        if np.linalg.norm(high - low) >= min_width * whole:
+        is_large = inside.sum() >= _LARGE_SHARE * len(points)
+        if np.linalg.norm(high - low) >= (_LARGE_WIDTH if is_large else 1.0) * min_width * whole:
             planes.append(plane)
         free[free] = np.abs(_along(plane, left, left_rays)) >= 2 * _INLIER * left_sigma
     return planes

@@ -219,12 +219,14 @@ class FirstVelocity(nn.Module):
         right = torch.einsum("bkp,bkpi,bp->bki", plane, along_normal, off_plane)
         right = right + torch.einsum("bkp,bkpai,bpa->bki", point_weights, along_axes, matched - at)
         if pictures is not None:
-            # A change of ``color_scale`` counts as much as a plane that is off by the smallest scale of a match. What
-            # pictures tell is taken as given: it has no gradient.
-            scale = self.picture_weight * (smallest / self.color_scale).square()
+            # A change of ``color_scale`` counts as much as a plane that is off by what planes are off: in perfect depth
+            # little, in noisy depth more than anything else. What pictures tell is taken as given, without gradients.
+            sure, off = plane.detach(), off_plane.detach().square()[:, None]
+            variance = (sure * off).sum(dim=-1, keepdim=True) / sure.sum(dim=-1, keepdim=True).clamp(min=1e-9)
+            scale = self.picture_weight * variance / self.color_scale**2
             known, seen = pictures.equations(at.detach())
             axes = along_axes.detach()
-            weighted = (scale[..., None] * members)[..., None, None] * axes
+            weighted = (scale * members)[..., None, None] * axes
             matrix = matrix + torch.einsum("bkpai,bpac,bkpcj->bkij", weighted, known, axes)
             right = right + torch.einsum("bkpai,bpa->bki", weighted, seen)
         count = members.sum(dim=2)[..., None]
