@@ -78,4 +78,4 @@ def test_a_table_stands_still_although_much_more_is_seen_behind_it() -> None:
 
 def test_a_plane_that_is_small_may_move_however_near_it_is() -> None:
     found, _, table = _masks(0.25)
-    assert table.mean() > 0.05 and found is not None and found[table].mean() > 0.95
+    assert table.mean() > 0.04 and found is not None and found[table].mean() > 0.95
