@@ -121,11 +121,11 @@ def off_wide_planes(
     """Return which valid pixels lie on no wide plane; None where no wide plane is found.
 
     Planes are fitted by RANSAC to the points of all views together; one counts where it holds many points and reaches
-    ``min_width`` of the diagonal of all that is seen (less where it holds a tenth of all points). For each plane, view and distance its bias and noise are found
-    anew: at grazing angles a sensor errs by more than it scatters. How many standard deviations a pixel lies off its
-    nearest plane, and the labels of its neighbours (mean field of a Potts model), decide. ``rays`` are one unit along
-    the optical axis, in the world; ``noise`` is a share of depth (``relative_noise``), and so is ``pixel_sizes``,
-    what a pixel covers.
+    ``min_width`` of the diagonal of all that is seen (less where it holds a tenth of all points). For each plane, view
+    and distance its bias and noise are found anew: at grazing angles a sensor errs by more than it scatters. How many
+    standard deviations a pixel lies off its nearest plane, and the labels of its neighbours (mean field of a Potts
+    model), decide. ``rays`` are one unit along the optical axis, in the world; ``noise`` is a share of depth
+    (``relative_noise``), and so is ``pixel_sizes``, what a pixel covers.
     """
     views = _Views(depth.astype(np.float64), rays.astype(np.float64), centers.astype(np.float64), valid)
     if valid.sum() < _MIN_IN_BIN:
