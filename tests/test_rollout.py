@@ -56,7 +56,8 @@ def test_single_steps_are_those_of_a_rollout(model_and_scene: tuple[Simulator, S
         moment = moment.step()
         assert moment.num_steps == number and same(moment.previous, before.particles)
         assert same(moment.particles, state)
-    assert not same(moment.particles, scene.current), "something must move, or this shows nothing"
+    first = replace(scene.current, pixels=None, pictures=None)
+    assert not same(moment.particles, first), "something must move, or this shows nothing"
 
 
 def test_two_plans_may_go_on_from_one_moment(model_and_scene: tuple[Simulator, Scene]) -> None:

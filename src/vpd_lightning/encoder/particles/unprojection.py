@@ -163,7 +163,7 @@ class UnprojectingEncoder(AbstractEncoder):
             normals=take(normals) if self.use_normals and normals is not None else None,
             driven=driven,
             pixels=index if self.use_normals else None,
-            pictures=Pictures(frames.rgb, frames.depth.detach(), frames.cameras) if self.use_normals else None,
+            pictures=_pictures(frames) if self.use_normals else None,
         )
         # That of the current frame is drawn; the frame before it has no other.
         if not self.has_scenery or purpose == "previous":
@@ -248,6 +248,11 @@ class UnprojectingEncoder(AbstractEncoder):
             indices.append(index)
             valids.append(valid)
         return torch.stack(indices), torch.stack(valids)
+
+
+def _pictures(frames: RGBDFrames) -> Pictures:
+    depth = torch.nan_to_num(frames.depth.detach(), nan=0.0, posinf=0.0, neginf=0.0)
+    return Pictures(frames.rgb, depth, frames.cameras)
 
 
 def _cropped(frames: RGBDFrames, candidates: Bool[Tensor, "batch point"]) -> RGBDFrames:
