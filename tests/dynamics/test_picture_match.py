@@ -16,7 +16,7 @@ from vpd_lightning.types import Cameras, Particles, Pictures
 SIZE = 24
 
 
-def looking(eye, at, size=SIZE):
+def looking(eye, at):
     """Return the pose of a camera: x right, y down, z towards ``at``."""
     forward = torch.nn.functional.normalize(torch.tensor(at).double() - torch.tensor(eye).double(), dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 0.3, -1.0]).double(), forward), dim=0)
@@ -115,7 +115,8 @@ def plain_equations(previous, current, places, spacing):
 def test_the_equations_are_those_of_plain_loops(seed):
     previous, current = random_frames(seed)
     index, spacing = torch.arange(40)[None], 0.15
-    places = current.positions + 0.05 * torch.randn(1, 40, 3, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(20 + seed)
+    places = current.positions + 0.05 * torch.randn(1, 40, 3, generator=generator, dtype=torch.float64)
     pictures = picture_match(previous, current, index, torch.tensor([spacing], dtype=torch.float64))
     matrix, right = pictures.equations(places)
     plain_matrix, plain_right = plain_equations(previous, current, places[0].numpy(), spacing)
@@ -169,7 +170,7 @@ def painted_board(shift, noise, seed, size=48):
             [torch.sin(9 * place[..., 0]), torch.sin(7 * place[..., 1] + 1), torch.cos(8 * place.sum(-1))]
         )
         rgb += torch.where(inside[..., None], 0.5 + 0.4 * waves.movedim(0, -1), 0.5) / 16
-        board |= inside if part == 5 else torch.zeros_like(inside)
+        board = inside if part == 5 else board  # depth is that of one ray near the middle
     depth = torch.where(board, distance, 3.0) * (1 + noise * torch.randn(size, size, generator=generator).double())
     directions = rays.directions[0, 0] / rays.directions[0, 0, ..., 2:]
     points = (directions * depth[..., None])[board]

@@ -82,8 +82,10 @@ def find_first_motion(
         matched = MatchedMotion(torch.zeros_like(seen.positions), torch.zeros_like(seen.positions[..., 0]))
     else:
         before = _surfels(previous, *gather_index(movable(previous)))
-        frames = (relative_to(frame, origin) for frame in (previous, current))
-        pictures = picture_match(*frames, index, point_spacing(near.positions, mask))
+        pictures = None
+        if first_velocity.picture_weight > 0:
+            frames = (relative_to(frame, origin) for frame in (previous, current))
+            pictures = picture_match(*frames, index, point_spacing(near.positions, mask))
         matched = first_velocity(near, bodies, replace(before, positions=before.positions - origin), pictures)
     return FirstMotion(index, mask, seen, bodies, labels.clamp(min=0), matched)
 
