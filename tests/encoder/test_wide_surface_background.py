@@ -8,7 +8,7 @@ import torch
 
 from tests.geometry.cast_scenes import FLOOR, TWO_EYES, WALL, Ball, Box, Plane, cast
 from vpd_lightning.encoder.particles.wide_surface_background import WideSurfaceBackground
-from vpd_lightning.geometry.noisy_planes import hangs_alone
+from vpd_lightning.geometry.hanging_points import hangs_alone
 from vpd_lightning.testing.scenes import ball_frames
 
 SETTINGS = {
@@ -271,3 +271,22 @@ def test_points_with_others_near_them_in_any_view_do_not_hang_alone():
     alone = hangs_alone(points, valid, np.full(valid.shape, 0.5))
     assert np.argwhere(alone).tolist() == [[0, 1, 1]]
     assert not hangs_alone(points, np.zeros_like(valid), np.full(valid.shape, 0.5)).any()
+
+
+def test_whether_points_hang_alone_is_what_all_distances_say():
+    draw = np.random.default_rng(3)
+    # A slope with steps, two views of it, some pixels lost: reaches from less than a pixel to a few.
+    rows, columns = np.meshgrid(np.arange(12.0), np.arange(14.0), indexing="ij")
+    depth = 0.3 * rows + draw.choice([0.0, 4.0, 40.0], (2, 12, 14), p=[0.6, 0.2, 0.2])
+    points = np.stack([rows + 0 * depth, columns + 0 * depth, depth], axis=-1)
+    valid = draw.random((2, 12, 14)) < 0.8
+    points[~valid] = np.nan
+    footprints = draw.uniform(0.2, 0.7, valid.shape)
+
+    found = hangs_alone(points, valid, footprints)
+
+    there = points[valid]
+    near = np.linalg.norm(there[:, None] - there, axis=-1) <= 4 * footprints[valid][:, None]
+    expected = near.sum(axis=1) - 1 < 4
+    assert 0 < expected.sum() < len(there)
+    assert np.array_equal(found[valid], expected) and not found[~valid].any()

@@ -8,6 +8,7 @@ import torch
 
 from tests.geometry.cast_scenes import FLOOR, Box, cast, looking_at
 from vpd_lightning.encoder.particles.wide_surface_background import WideSurfaceBackground
+from vpd_lightning.geometry import local_planes
 from vpd_lightning.geometry.local_planes import plane_depth
 from vpd_lightning.types import RGBDFrames
 
@@ -144,3 +145,23 @@ def test_no_more_frames_are_kept_than_was_asked_for():
         background.restored(frames(scattered(depth, seed), rgb))
 
     assert len(background._restored) == 2
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_compiled_loops_find_what_operations_on_images_find(dtype, monkeypatch):
+    """Colours with shades, lost pixels, a patch with nothing in reach, what is no number, images that are no copies."""
+    pytest.importorskip("numba")
+    depth, rgb, _ = scene()
+    draw = torch.Generator().manual_seed(2)
+    noisy = scattered(depth) * (torch.rand(depth.shape, generator=draw, dtype=depth.dtype) > 0.2)
+    noisy[:, 5:20, 5:20] = 0
+    noisy[0, 30, 30], noisy[1, 31, 31] = torch.nan, torch.inf
+    shades = rgb + 0.05 * torch.rand(rgb.shape, generator=draw, dtype=rgb.dtype)
+    given = noisy.to(dtype).mT.contiguous().mT, shades.to(dtype), NOISE, PIXEL
+
+    found = plane_depth(*given)
+    monkeypatch.setattr(local_planes, "_compiled", lambda: None)
+    expected = plane_depth(*given)
+
+    assert (found == 0).any() and found.dtype == dtype
+    torch.testing.assert_close(found, expected, rtol=1e-12 if dtype == torch.float64 else 1e-5, atol=0)

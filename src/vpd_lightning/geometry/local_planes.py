@@ -1,12 +1,15 @@
 """Noisy depth as planes fitted around every pixel: it scatters less, and pixels beside a surface get its depth."""
 
+import functools
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vpd_lightning.geometry.decay import decay
+from vpd_lightning.geometry.decay import NEGLIGIBLE, decay
+from vpd_lightning.threads import in_threads
 
 _REACH = 3
 """Pixels to each side whose depth is looked at."""
@@ -72,13 +75,36 @@ def plane_depth(
 
     ``noise`` is the standard deviation of each image as a share of depth, ``pixel_sizes`` what a pixel covers as a
     share of depth. Joint bilateral filtering (Petschnigg et al. 2004; Eisemann and Durand 2004), with planes for
-    constants and robust weights for the range filter.
+    constants and robust weights for the range filter. On a CPU with numba by compiled loops.
     """
-    return torch.stack([_fitted(*image) for image in zip(depth, rgb, noise, pixel_sizes, strict=True)])
+    depth = torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0).clamp(min=0)
+    compiled = _compiled() if depth.device.type == "cpu" else None
+    if compiled is None or depth.dtype not in (torch.float32, torch.float64):
+        return torch.stack([_fitted(*image) for image in zip(depth, rgb, noise, pixel_sizes, strict=True)])
+    constants = _WIDTH, _COLOR_SCALE, _JUMP, _ROBUST, _RIDGE, float(_NUM_ROUNDS), _MIN_WEIGHT, _MAX_CORRECTION
+    result = torch.empty_like(depth, memory_format=torch.contiguous_format)
+    images = zip(
+        depth.contiguous(), rgb.to(depth).contiguous(), noise.tolist(), pixel_sizes.tolist(), result, strict=True
+    )
+
+    def fill(image: tuple[Tensor, Tensor, float, float, Tensor]) -> None:
+        one, colors, scatter, size, into = image
+        compiled(one.numpy(), colors.numpy(), scatter, size, _REACH, (*constants, NEGLIGIBLE), into.numpy())
+
+    in_threads(fill, list(images))
+    return result
+
+
+@functools.cache
+def _compiled() -> Callable[..., None] | None:
+    try:
+        from vpd_lightning.geometry.plane_fits_numba import plane_fits
+    except ImportError:
+        return None
+    return plane_fits  # type: ignore[no-any-return]
 
 
 def _fitted(depth: Tensor, rgb: Tensor, noise: Tensor, pixel_size: Tensor) -> Float[Tensor, "height width"]:
-    depth = torch.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0).clamp(min=0)
     steps = torch.arange(-_REACH, _REACH + 1, dtype=depth.dtype, device=depth.device)
     rows, columns = (axis.flatten() for axis in torch.meshgrid(steps, steps, indexing="ij"))
     rgb, noise, pixel_size = rgb.to(depth), noise.to(depth), pixel_size.to(depth)

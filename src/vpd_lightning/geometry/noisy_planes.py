@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+
+from vpd_lightning.geometry.hanging_points import hangs_alone
 
 _STEP = 3
 """Pixels between the three depths that are compared to find noise: neighbours err alike, so nearer ones hide it."""
@@ -48,9 +49,6 @@ _FAR = 1e9  # whose square is a number
 _MIN_ALIKE = 2
 _MAX_STEEPNESS = 4.0
 """Neighbours of its own surface that a pixel of a body has; tangent to the rays up to which they are of its surface."""
-
-_SUPPORT_REACH, _MIN_SUPPORT = 4.0, 4
-"""Widths of a pixel within which a point of a surface has so many others, in any view."""
 
 _NUM_ROUNDS = 8
 _MIN_PIXELS = 5
@@ -270,26 +268,6 @@ def _median(values: NDArray[np.float64]) -> float:
     if len(values) % 2:
         return float(np.partition(values, middle)[middle])
     return float(np.partition(values, (middle - 1, middle))[middle - 1 : middle + 1].mean())
-
-
-def hangs_alone(
-    points: Float[NDArray[np.floating], "view height width 3"],
-    valid: Bool[NDArray[np.bool_], "view height width"],
-    footprints: Float[NDArray[np.floating], "view height width"],
-) -> Bool[NDArray[np.bool_], "view height width"]:
-    """Return valid pixels that have hardly any others near them in space, points of all views together.
-
-    Between what lies before and behind them in a picture they hang in the air; a body that meets one is thrown off its
-    way. ``footprints`` are the widths of pixels at their depth, metres.
-    """
-    found, alone = points[valid], np.zeros_like(valid)
-    if len(found):
-        reach = _SUPPORT_REACH * footprints[valid]
-        # Itself among them, so many lie within reach unless the next one does not: to count all takes thrice as long.
-        tree = cKDTree(found, balanced_tree=False)
-        distance, _ = tree.query(found, k=[_MIN_SUPPORT + 1], distance_upper_bound=np.nextafter(reach.max(), np.inf))
-        alone[valid] = distance[:, 0] > reach
-    return alone
 
 
 def _settled(deviations: NDArray[np.float64], valid: NDArray[np.bool_]) -> Bool[NDArray[np.bool_], "height width"]:

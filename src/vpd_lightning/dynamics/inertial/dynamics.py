@@ -201,8 +201,7 @@ class InertialDynamics(AbstractDynamics):
             static_index, static_mask = gather_index(current.mask & ~movable(current))
             static_positions = take(current.positions, static_index)
             static_normals = take(current.normals, static_index)  # type: ignore[arg-type]
-            if self.edge_reach is not None:
-                static_normals = trusted_normals(static_positions, static_normals, static_mask)
+            static_normals = trusted_normals(static_positions, static_normals, static_mask)
             mirrored = mask & may_be_hidden(
                 (static_positions, static_normals, static_mask),
                 seen.positions, bodies, centers, self.contact_reach,

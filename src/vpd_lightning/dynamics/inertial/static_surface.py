@@ -11,6 +11,7 @@ from vpd_lightning.dynamics.inertial.contact_search import ContactPoints, Contac
 from vpd_lightning.dynamics.inertial.round_bodies import on_feet
 from vpd_lightning.dynamics.inertial.surface_edges import SurfaceEdges, surface_edges
 from vpd_lightning.geometry.spacing import point_spacing
+from vpd_lightning.graph.neighbors import knn
 
 _BEHIND = 0.005
 """Metres by which a seen point may be behind a tangent plane that it is above: noise of the plane."""
@@ -18,8 +19,8 @@ _BEHIND = 0.005
 _AT_WALL = 2.0
 """Of its reach: how near to the side of the workspace a surface is cut by it, and goes on unseen."""
 
-_NUM_NEIGHBOURS, _NUM_AGREEING, _AGREEMENT = 8, 4, 0.9
-"""A normal is trusted that so many of the nearest particles share, to this cosine."""
+_NUM_NEIGHBOURS, _AGREEMENT = 8, 0.9
+"""A normal is trusted that half of so many nearest particles share, to this cosine."""
 
 _MOST_CLEARANCE, _MOST_SUNK = 0.75, 0.45
 """Of a body's size: what seems to end farther above its surface does not rest on it; farther below it, its guessed
@@ -59,18 +60,22 @@ def trusted_normals(
     normals: Float[Tensor, "batch point 3"],
     mask: Bool[Tensor, "batch point"],
 ) -> Float[Tensor, "batch point 3"]:
-    """Return the normals, zero where too few of the nearest particles share them.
+    """Return the normals, zero where less than half of the nearest particles share them.
 
     At an edge a normal is that of neither side, and its tangent plane cuts into what stands on the surface beside it.
+    In noisy depth a stray particle of the floor is a wall, and without an edge one that goes on for metres.
     """
     oriented = mask & (normals.square().sum(dim=-1) > 0.5)
-    apart = _distances(positions, positions)
-    apart = apart.masked_fill(~(oriented[:, :, None] & oriented[:, None]), torch.inf)
-    apart.diagonal(dim1=1, dim2=2).fill_(torch.inf)
-    near = apart.topk(min(_NUM_NEIGHBOURS, apart.shape[-1]), dim=-1, largest=False)
-    cosines = torch.einsum("bpi,bqi->bpq", normals, normals).gather(2, near.indices)
-    agreeing = ((cosines > _AGREEMENT) & torch.isfinite(near.values)).sum(dim=-1)
-    return normals * (agreeing >= _NUM_AGREEING)[..., None]
+    trusted = torch.zeros_like(mask)
+    for row, usable in enumerate(oriented):
+        own = usable.nonzero()[:, 0]
+        near = knn(positions[row, own], positions[row, own], _NUM_NEIGHBOURS + 1)
+        others = near.mask & (near.index != torch.arange(len(own), device=own.device)[:, None])
+        facing = normals[row, own]
+        cosines = (facing[near.index] * facing[:, None]).sum(dim=-1)
+        agreeing = (others & (cosines > _AGREEMENT)).sum(dim=-1)
+        trusted[row, own] = 2 * agreeing >= others.sum(dim=-1)
+    return normals * trusted[..., None]
 
 
 @torch.no_grad()

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from vpd_lightning.encoder.base import AbstractBackground
 from vpd_lightning.geometry.cameras import unproject
+from vpd_lightning.geometry.hanging_points import hangs_alone
 from vpd_lightning.geometry.local_planes import between_surfaces, plane_depth
-from vpd_lightning.geometry.noisy_planes import hangs_alone, off_wide_planes, relative_noise
+from vpd_lightning.geometry.noisy_planes import off_wide_planes, relative_noise
 from vpd_lightning.geometry.normals import depth_normals
 from vpd_lightning.geometry.wide_surfaces import wide_surfaces
 from vpd_lightning.types import RGBDFrames
