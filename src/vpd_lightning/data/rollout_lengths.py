@@ -41,3 +41,12 @@ class RolloutLengths:
         if len(lengths) == 1:
             return lengths[0]
         return lengths[int(numpy_generator(seed, step, "rollout length").integers(len(lengths)))]
+
+    def ahead(self, fraction: float) -> list[tuple[float, list[int]]]:
+        """Return the shares of the training that lie beyond ``fraction`` and the T that each draws from, in order."""
+        starts = sorted(self._lengths)
+        parts = [
+            (end - max(start, fraction), self._lengths[start])
+            for start, end in zip(starts, [*starts[1:], 1.0], strict=True)
+        ]
+        return [(share, lengths) for share, lengths in parts if share > 0]

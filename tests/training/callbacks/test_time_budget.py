@@ -10,6 +10,7 @@ import torch
 
 from tests.data.recordings import write_recordings
 from tests.training.tiny_training import tiny_data, tiny_module, tiny_trainer
+from vpd_lightning.data.rollout_lengths import RolloutLengths
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.training.callbacks.time_budget import FILE, TimeBudget
 from vpd_lightning.training.checkpoint_files import load_checkpoint
@@ -180,6 +181,43 @@ def test_clips_grow_with_the_share_of_the_time(data: Path, tmp_path: Path) -> No
     changed = lengths.values.index(3)
     assert set(lengths.values[:changed]) == {1} and set(lengths.values[changed:]) == {3}
     assert 15 <= changed <= 17  # batches are read one ahead
+
+
+class LongerTakesLonger(ScriptedBudget):
+    """A second for every frame that is read or predicted; notes how many updates are expected."""
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        super().on_train_start(trainer, pl_module)
+        self.expected: dict[int, int] = {}
+
+    def on_before_optimizer_step(self, *args: Any) -> None:
+        pass
+
+    def on_train_batch_end(self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int) -> None:
+        self.time += batch.rgbs.shape[1] + 2.0
+        super().on_train_batch_end(trainer, module, outputs, batch, index)
+        self.expected[self._steps] = self.expected_steps(1000)
+
+
+def test_what_longer_clips_will_take_is_expected_from_the_start(data: Path, tmp_path: Path) -> None:
+    settings = {"num_steps_schedule": {0.0: 1, 0.5: [3, 5]}, "num_workers": 0}
+    tiny_trainer(tmp_path, 1000, [budget := LongerTakesLonger(minutes=6.0)]).fit(
+        tiny_module(), tiny_data(data, **settings)
+    )
+
+    # Three minutes of updates of 3 s, and three of updates of 5 or 7.
+    assert budget.expected[10] == 60 + 30
+    assert all(abs(expected - budget._steps) <= 3 for step, expected in budget.expected.items() if step >= 10)
+
+
+def test_a_training_from_before_paces_were_kept_by_length_goes_on(data: Path, tmp_path: Path) -> None:
+    budget = LongerTakesLonger(minutes=3.0)
+    budget._lengths = RolloutLengths(1, {0.0: 1, 0.5: 4})
+    budget.load_state_dict(
+        {"seconds": 60.0, "seconds_before": 0.0, "steps": 20, "paced_seconds": 51.0, "paced_steps": 17}
+    )
+    # 30 s more of updates of 3 s, and 90 s of updates that take twice as long
+    assert budget.expected_steps(1000) == 20 + 10 + 15
 
 
 def test_a_schedule_whose_data_other_processes_read_is_refused(data: Path, tmp_path: Path) -> None:

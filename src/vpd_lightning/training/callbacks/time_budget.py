@@ -7,8 +7,10 @@ from typing import Any, Literal
 
 import lightning.pytorch as pl
 
+from vpd_lightning.data.rollout_lengths import RolloutLengths
 from vpd_lightning.errors import ConfigError
 from vpd_lightning.files import AtomicPath
+from vpd_lightning.training.callbacks.pace import Pace
 from vpd_lightning.training.module import VPDModule
 
 FILE = "training_time.json"
@@ -21,10 +23,10 @@ class TimeBudget(pl.Callback):
 
     ``clock`` is ``wall``, or ``cpu``: the processor time of this process, which other work on the same machine hardly
     changes; it does not depend on loader workers or accelerators. With several devices, the first one's time counts.
-    Reading data counts; validations, pictures and
-    checkpoints do not. The learning rate's schedule follows the time: the updates that the budget will allow are
-    estimated from the pace so far. Such a training does not repeat bit for bit. The time used is written to
-    ``training_time.json`` in the run folder, and ``seconds_before`` (of a first training and what it prepared) counts.
+    Reading data counts; validations, pictures and checkpoints do not. The learning rate's schedule follows the time:
+    the updates that the budget will allow are estimated from the pace so far, and from what longer rollouts will take
+    (``Pace``). Such a training does not repeat bit for bit. The time used is written to ``training_time.json`` in the
+    run folder, and ``seconds_before`` (of a first training and what it prepared) counts.
     """
 
     def __init__(self, *, minutes: float | None, clock: Literal["wall", "cpu"]) -> None:
@@ -35,7 +37,8 @@ class TimeBudget(pl.Callback):
         self.seconds_before = 0.0
         self.seconds = 0.0
         self._steps = 0
-        self._paced_seconds, self._paced_steps = 0.0, 0
+        self._pace = Pace()
+        self._lengths: RolloutLengths | None = None  # where they change in the course of the training
         self._since_start = 0
         self._started: float | None = None
 
@@ -51,9 +54,11 @@ class TimeBudget(pl.Callback):
     def expected_steps(self, max_steps: int) -> int:
         """How many updates the budget will allow, as far as is known; at most ``max_steps``."""
         allowed = self.seconds_allowed
-        if allowed is None or self._steps < _FIRST_GUESS or self._paced_seconds <= 0:
+        if allowed is None or self._steps < _FIRST_GUESS or not self._pace.is_known:
             return max_steps
-        further = max(0.0, allowed - self.seconds) * self._paced_steps / self._paced_seconds
+        share = min(1.0, self.seconds / allowed)
+        ahead = [(1.0 - share, list[int]())] if self._lengths is None else self._lengths.ahead(share)
+        further = sum(part * allowed / self._pace.seconds_per_step(lengths) for part, lengths in ahead)
         return max(1, min(max_steps, self._steps + round(further)))
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
@@ -79,6 +84,7 @@ class TimeBudget(pl.Callback):
                 f" {datamodule.num_workers} processes that read data cannot see.\n"
                 "Set data.num_workers=0, or data.num_steps_schedule=null."
             )
+        self._lengths = RolloutLengths(datamodule.num_steps, datamodule.num_steps_schedule)
         datamodule.training_progress = lambda: min(1.0, self.seconds / (self.seconds_allowed or 1.0))
 
     @staticmethod
@@ -112,13 +118,14 @@ class TimeBudget(pl.Callback):
         self._steps = trainer.global_step
         self._since_start += 1
         if self._since_start > _WARM_UP:
-            self._paced_seconds, self._paced_steps = self._paced_seconds + spent, self._paced_steps + 1
+            self._pace.count(0 if self._lengths is None else batch.rgbs.shape[1], spent)
         self._stop_where_time_is_up(trainer)
 
     def _stop_where_time_is_up(self, trainer: pl.Trainer) -> None:
         if trainer.world_size > 1:  # all devices stop at the same step, and have the same learning rates up to there
-            mine = (self.seconds, self.seconds_before, self._paced_seconds)
-            self.seconds, self.seconds_before, self._paced_seconds = trainer.strategy.broadcast(mine, src=0)
+            mine = (self.seconds, self.seconds_before, self._pace.counted)
+            self.seconds, self.seconds_before, counted = trainer.strategy.broadcast(mine, src=0)
+            self._pace.counted = dict(counted)
         allowed = self.seconds_allowed
         if allowed is not None and self.seconds >= allowed:
             trainer.should_stop = True
@@ -163,14 +170,18 @@ class TimeBudget(pl.Callback):
             "seconds": self.seconds,
             "seconds_before": self.seconds_before,
             "steps": self._steps,
-            "paced_seconds": self._paced_seconds,
-            "paced_steps": self._paced_steps,
+            "pace": [[length, *counted] for length, counted in self._pace.counted.items()],
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on counting."""
         self.seconds, self._steps = float(state_dict["seconds"]), int(state_dict["steps"])
         self.seconds_before = float(state_dict["seconds_before"])
-        # Checkpoints from before the pace was kept apart: the mean over all updates.
-        self._paced_seconds = float(state_dict.get("paced_seconds", self.seconds))
-        self._paced_steps = int(state_dict.get("paced_steps", self._steps))
+        self._pace, pace = Pace(), state_dict.get("pace")
+        if pace is None:  # from before the pace was kept by length: the mean over all updates, as of those that follow
+            share = min(self.seconds / (self.seconds_allowed or 1.0), 0.999)
+            length = 0 if self._lengths is None else self._lengths.ahead(share)[0][1][0]
+            pace = [[length, state_dict.get("paced_seconds", self.seconds), state_dict.get("paced_steps", self._steps)]]
+        for length, seconds, steps in pace:
+            if steps:
+                self._pace.count(int(length), float(seconds), int(steps))
