@@ -141,10 +141,15 @@ def _built(
 
 
 def particles_at(positions: Tensor, mode: Mode, device: torch.device, seed: int = 0, **changes: Any) -> Particles:
-    """Return a batch of one with all optional observations; every second particle may move."""
+    """Return a batch of one with all optional observations; every second particle may move.
+
+    The others face up, tilted by some ten degrees: a normal that its neighbours do not share is trusted by no contact.
+    """
     generator = torch.Generator().manual_seed(seed)
     count = len(positions)
     normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    normals[1::2] = torch.nn.functional.normalize(up + 0.2 * normals[1::2], dim=-1)
     particles = Particles(
         positions=positions[None],
         features=torch.rand(1, count, FEATURE_DIM, generator=generator, dtype=torch.float64),
