@@ -23,9 +23,12 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
     "clean": (),
     "structured_light_0.2": ("sensor=structured_light", "sensor.percent_at_median=0.2"),
     "active_stereo_0.5": ("sensor=active_stereo", "sensor.percent_at_median=0.5"),
-    "trigger_15ms": ("sensor=structured_light", "sensor.percent_at_median=0.2", "sensor.trigger_offset=0.015"),
+    "trigger_15ms": (
+        "sensor=structured_light", "sensor.percent_at_median=0.2", "sensor.trigger_offset=0.015",
+        "sensor.trigger_steps=5",  # divides the physics steps of a frame in all scenes
+    ),
     "poses_5mm": ("sensor=structured_light", "sensor.percent_at_median=0.2", "sensor.pose_offset=0.005"),
-}
+}  # fmt: skip
 MODELS: dict[str, tuple[str, ...]] = {
     # The demo's 1,600 updates take ten minutes of two cores.
     "inertial": ("model=inertial", "budget=minutes", "callbacks.time_budget.minutes=10"),
