@@ -30,7 +30,7 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
     "poses_5mm": ("sensor=structured_light", "sensor.percent_at_median=0.2", "sensor.pose_offset=0.005"),
 }  # fmt: skip
 MODELS: dict[str, tuple[str, ...]] = {
-    # The demo's 1,600 updates take ten minutes of two cores.
+    # No more than the demo's training takes (docs/results/demo_released.json).
     "inertial": ("model=inertial", "budget=minutes", "callbacks.time_budget.minutes=10"),
     # As docs/notes.md ("What more training would bring") trains it, half as wide.
     "vpd_staged": (
