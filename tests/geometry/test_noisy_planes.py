@@ -79,3 +79,27 @@ def test_a_table_stands_still_although_much_more_is_seen_behind_it() -> None:
 def test_a_plane_that_is_small_may_move_however_near_it_is() -> None:
     found, _, table = _masks(0.25)
     assert table.mean() > 0.04 and found is not None and found[table].mean() > 0.95
+
+
+def test_what_is_above_the_horizon_moves_unless_it_hangs_alone() -> None:
+    """There no ray meets the floor, and how far a pixel lies behind it is infinite."""
+    draw = np.random.default_rng(0)
+    rows, columns = np.mgrid[:96, :128] + 0.5
+    rays = np.stack([(columns - 64) / 100, (rows - 40) / 100, np.ones((96, 128))], axis=-1)
+    with np.errstate(divide="ignore"):
+        floor = np.where(rays[..., 1] > 0.05, 0.5 / rays[..., 1], 0.0)
+    ball = (columns - 64) ** 2 + (rows - 25) ** 2 < 12**2
+    depth = np.where(
+        ball, 3 - np.sqrt(np.maximum(0.36**2 - (0.03 * (columns - 64)) ** 2 - (0.03 * (rows - 25)) ** 2, 0)), floor
+    )
+    alone = np.zeros_like(ball)
+    alone[5:15:5, 10:120:10] = True
+    depth = np.where(alone, 2.0, depth) * (1 + 0.003 * draw.normal(size=depth.shape))
+
+    found = off_wide_planes(
+        depth[None], rays[None], np.zeros((1, 3)), depth[None] > 0, np.array([0.003]), np.array([0.01]), min_width=0.4
+    )
+
+    assert found is not None
+    assert found[0][ball].mean() > 0.98
+    assert not found[0][alone].any() and not found[0][(floor > 0) & ~ball].any()

@@ -164,6 +164,23 @@ def test_a_few_strays_join_the_nearest_body():
     assert torch.equal(labelled(positions, normals), torch.cat([truth, torch.tensor([0, 1])]))
 
 
+@pytest.mark.parametrize("number", [1, 5])
+def test_strays_farther_than_a_body_is_long_belong_to_none(number):
+    strays = torch.tensor([10.0, 0.0, 0.0], dtype=torch.float64) + 0.01 * torch.eye(5, 3, dtype=torch.float64)[:number]
+    positions, normals, truth = joined((*random_ball(120, 1), (0, 0, 0)), (*random_ball(60, 0), (1, 0, 0)))
+    positions, normals = torch.cat([strays, positions]), torch.cat([torch.zeros_like(strays), normals])
+
+    assert torch.equal(labelled(positions, normals), torch.cat([torch.full((number,), -1), truth]))
+
+
+def test_a_distant_island_is_a_body():
+    distant = torch.tensor([10.0, 0.0, 0.0], dtype=torch.float64) + random_ball(60, 0)[0]
+    positions, normals, truth = joined((*random_ball(120, 1), (0, 0, 0)))
+    both = torch.cat([positions, distant]), torch.cat([normals, random_ball(60, 0)[1]])
+
+    assert torch.equal(labelled(*both), torch.cat([truth, torch.full((60,), 1)]))
+
+
 def scenes():
     return [
         joined((*random_cube(150, 1), (0, 0, 0)), (*random_cube(100, 2), (0.5, 0.1, 0.2))),

@@ -136,17 +136,19 @@ def off_wide_planes(
     nearest = np.abs(every).argmin(axis=0)[None]
     signed, scatters = (np.take_along_axis(np.stack(parts), nearest, axis=0)[0] for parts in zip(*judged, strict=True))
     normals, heights = np.stack(planes)[nearest[0]][..., :3], np.stack(planes)[nearest[0]][..., 3]
-    beside = np.abs((views.points * normals).sum(axis=-1) - heights)  # metres
+    points = views.points
+    beside = np.abs((points * normals).sum(axis=-1) - heights)  # metres
     result = np.zeros_like(valid)
     for view, there in enumerate(valid):
         moving = _settled(signed[view], there)
         reach = np.maximum(_ALIKE * np.sqrt(2) * scatters[view], _MAX_STEEPNESS * pixel_sizes[view])
         with np.errstate(invalid="ignore"):
             shares = signed[view] * scatters[view]
-            moving = _without_specks(_without_flying(moving, shares, reach), np.abs(signed[view]))
-            result[view] = moving & ~_rims(moving & (shares > 0), shares, reach, views.points[view], beside[view])
+            moving = _without_flying(moving, shares, views.depth[view], reach)
+            moving = _without_specks(moving, np.abs(signed[view]))
+            result[view] = moving & ~_rims(moving & (shares > 0), shares, reach, points[view], beside[view])
     # What lies beside a body in the picture alone, and half a metre off, would drag it along where it meets the floor.
-    return result & ~hangs_alone(views.points, result, views.depth * pixel_sizes[:, None, None])
+    return result & ~hangs_alone(points, result, views.depth * pixel_sizes[:, None, None])
 
 
 def _wide_planes(views: _Views, noise: NDArray[np.float64], min_width: float) -> list[NDArray[np.float64]]:
@@ -285,15 +287,22 @@ def _settled(deviations: NDArray[np.float64], valid: NDArray[np.bool_]) -> Bool[
 
 
 def _without_flying(
-    moving: NDArray[np.bool_], residuals: NDArray[np.float64], reach: NDArray[np.float64]
+    moving: NDArray[np.bool_], residuals: NDArray[np.float64], depth: NDArray[np.float64], reach: NDArray[np.float64]
 ) -> Bool[NDArray[np.bool_], "height width"]:
     """Return moving pixels without those that hang alone between near and far.
 
-    ``reach`` says how far apart neighbours on one surface may be, as a share of their depth.
+    ``reach`` says how far apart neighbours on one surface may be, as a share of their depth. It is compared by how far
+    they lie behind the plane, and above its horizon, where that is infinite, by their depth.
     """
     values, there = _padded(residuals, np.inf), _padded(moving, False)
-    alike = sum((_apart(values, each) < reach) & _beside(there, each) for each in _NEIGHBOURS)
-    return moving & (np.asarray(alike) >= _MIN_ALIKE)
+    distances = _padded(np.log(np.where(moving, depth, 1.0)), np.inf)
+    above = ~np.isfinite(values)
+    alike = np.zeros(moving.shape, np.int64)
+    for each in _NEIGHBOURS:
+        unknown = _beside(above, (0, 0)) | _beside(above, each)
+        apart = np.where(unknown, _apart(distances, each), _apart(values, each))
+        alike += (apart < reach) & _beside(there, each)
+    return moving & (alike >= _MIN_ALIKE)
 
 
 def _padded(values: NDArray[Any], outside: float) -> NDArray[Any]:

@@ -31,6 +31,9 @@ _SAME_TONE_REACH = 2.5
 _MIN_PARTICLES, _MIN_SHARE = 8, 0.0125
 """An island of fewer particles is no body. One of a smaller share of all is one only if no other island is near."""
 
+_MIN_LENGTH = 2.5
+"""No body is taken for shorter than this many usual spacings."""
+
 
 @torch.no_grad()
 def label_bodies(
@@ -44,7 +47,7 @@ def label_bodies(
     max_concavity: float,
     max_concave_share: float,
 ) -> Int64[Tensor, "batch particle"]:
-    """Return the body of each particle, from 0 (the one with most particles) on; -1 where ``mask`` is false.
+    """Return the body of each particle, from 0 (the one with most particles) on; -1 where it belongs to none.
 
     Two particles are linked where they lie within ``link`` spacings of each other and the surface between them is not
     concave: (n_i - n_j) . (x_i - x_j) / |x_i - x_j| is at least ``-max_concavity`` (after the convexity criterion of
@@ -53,8 +56,9 @@ def label_bodies(
     concave would be enough to join two bodies. Islands are merged again if nearly all pairs between them are not
     concave, or if they are close and of one and the same colour: parts of a concave body, which convexity alone would
     divide. So two touching bodies of one colour are taken for one. Particles in no island of some size, and islands
-    beyond ``num_bodies``, join the nearest body. Scene by scene, on the CPU; the numbers do not depend on the order of
-    the particles, nor on the world's origin or scale.
+    beyond ``num_bodies``, join the nearest body, but for strays that are farther from it than it is long: they belong
+    to none, and so do particles where ``mask`` is false. Scene by scene, on the CPU; the numbers do not depend on the
+    order of the particles, nor on the world's origin or scale.
     """
     labels = torch.full(mask.shape, -1, dtype=torch.int64)
     for member, own in enumerate(mask.cpu()):
@@ -116,6 +120,11 @@ def _joined_by_color(islands: np.ndarray, points: np.ndarray, colors: np.ndarray
     return _islands(senders, receivers, len(sizes))[islands]
 
 
+def _length(points: np.ndarray) -> float:
+    """Return the diameter (metres) of the sphere around the mean of the points that holds them all."""
+    return 2 * float(np.linalg.norm(points - points.mean(axis=0), axis=-1).max())
+
+
 def _label(
     points: np.ndarray,
     normals: np.ndarray,
@@ -167,6 +176,10 @@ def _label(
     stray = labels < 0
     if stray.any():
         kept = np.flatnonzero(~stray)
-        _, nearest = cKDTree(points[kept]).query(points[stray])
-        labels[stray] = labels[kept[nearest]]
+        distance, nearest = cKDTree(points[kept]).query(points[stray])
+        joins = labels[kept[nearest]]
+        # Noise takes single particles far from everything for moving. One that joined a body would shift its centre.
+        lengths = np.array([_length(points[labels == body]) for body in range(len(large))])
+        is_far = (sizes[islands[stray]] < _MIN_PARTICLES) & (distance > lengths.clip(_MIN_LENGTH * usual)[joins])
+        labels[stray] = np.where(is_far, -1, joins)
     return labels

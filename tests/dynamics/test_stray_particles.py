@@ -1,4 +1,4 @@
-"""One stray particle of the floor, as noisy depth has them, throws no body aside."""
+"""Stray particles, as noisy depth has them, throw no body aside: one of the floor, and some taken for moving."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.dynamics.solids import cube
-from tests.dynamics.test_inertial import dynamics, scene
+from tests.dynamics.test_inertial import dynamics, random_toss, scene
 from vpd_lightning.dynamics.inertial import dynamics as module
 from vpd_lightning.randomness import RandomKeys
 
@@ -46,3 +46,28 @@ def test_a_floor_acts_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
     found = displacement(is_stray=False)
     monkeypatch.setattr(module, "trusted_normals", lambda positions, normals, mask: normals)
     assert torch.equal(displacement(is_stray=False), found)
+
+
+def step_of_a_tossed_cube(num_strays: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return by how much each of the cube's particles, and each stray ten metres away, moves in the first step."""
+    before, now, _ = random_toss(1)
+    previous, current = scene(*before), scene(*now)
+    places, moving = current.positions.clone(), current.moving.clone()
+    strays = slice(len(now[0]), len(now[0]) + num_strays)
+    places[0, strays] += torch.tensor([10.0, 0.0, 3.0])
+    moving[0, strays] = True
+    current = replace(current, positions=places, moving=moving)
+    model, keys = dynamics().eval(), RandomKeys.fixed(1)
+    with torch.no_grad():
+        following, _ = model(previous, current, model.initialize(previous, current, keys), keys, 0)
+    moved = (following.positions - current.positions)[0]
+    return moved[: len(now[0])], moved[strays]
+
+
+def test_what_is_far_from_a_body_does_not_move_with_it() -> None:
+    alone, _ = step_of_a_tossed_cube(0)
+    found, strays = step_of_a_tossed_cube(5)
+
+    assert alone.norm(dim=-1).mean() > 0.02
+    assert (found - alone).norm(dim=-1).max() < 2e-3
+    assert not strays.any()
