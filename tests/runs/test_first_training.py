@@ -209,10 +209,12 @@ def test_weights_of_other_settings_and_frozen_weights_without_an_origin_are_refu
 
     simulator, path = tiny_simulator(), tmp_path / "last.ckpt"
     state = {f"simulator.encoder.{name}": value for name, value in simulator.encoder.state_dict().items()}
-    first = {"encoder": {"size": {"width": 8}, "ray_chunk_size": 1, "x_backend": "a"}, "renderer": {"samples": 1}}
+    ignored = {"ray_chunk_size": 1, "num_particles": 1, "x_backend": "a"}
+    first = {"encoder": {"size": {"width": 8}, **ignored}, "renderer": {"samples": 1}}
     write_checkpoint({"state_dict": state, "hyper_parameters": first}, path)
 
-    second = {"encoder": {"size": {"width": 8}, "ray_chunk_size": 2, "x_backend": "b"}, "renderer": {"samples": 2}}
+    ignored = {"ray_chunk_size": 2, "num_particles": 2, "x_backend": "b"}
+    second = {"encoder": {"size": {"width": 8}, **ignored}, "renderer": {"samples": 2}}
     load_pretrained(simulator, path, second)  # no weight of the renderer is taken
     with pytest.raises(CheckpointError, match=r"encoder\.size\.width=8, but the second training has 9"):
         load_pretrained(simulator, path, {**second, "encoder": {"size": {"width": 9}}})

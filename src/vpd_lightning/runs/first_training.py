@@ -30,8 +30,8 @@ DONE_FILE = "done.json"
 PREPARATION_FILE = "preparation.json"
 """What it took to make the slots it lies beside: seconds, and by which clock."""
 _STAGES = ("encoder", "dynamics", "renderer")
-# How something is computed, not what.
-_IGNORED, _IGNORED_END = ("ray_chunk_size", "checkpoint_chunks", "compile"), "_backend"
+# How something is computed, not what; and how many pixels become particles, which no weight depends on.
+_IGNORED, _IGNORED_END = ("ray_chunk_size", "checkpoint_chunks", "compile", "num_particles"), "_backend"
 
 log = logging.getLogger(__name__)
 
