@@ -291,16 +291,16 @@ def _without_flying(
 ) -> Bool[NDArray[np.bool_], "height width"]:
     """Return moving pixels without those that hang alone between near and far.
 
-    ``reach`` says how far apart neighbours on one surface may be, as a share of their depth. It is compared by how far
-    they lie behind the plane, and above its horizon, where that is infinite, by their depth.
+    ``reach`` says how far apart neighbours on one surface may be, as a share of their depth: in how far they lie behind
+    the plane or, above its horizon, where that is infinite, in the logarithm of their depth.
     """
     values, there = _padded(residuals, np.inf), _padded(moving, False)
     distances = _padded(np.log(np.where(moving, depth, 1.0)), np.inf)
-    above = ~np.isfinite(values)
+    above_horizon = ~np.isfinite(values)
     alike = np.zeros(moving.shape, np.int64)
     for each in _NEIGHBOURS:
-        unknown = _beside(above, (0, 0)) | _beside(above, each)
-        apart = np.where(unknown, _apart(distances, each), _apart(values, each))
+        either_above = _beside(above_horizon, (0, 0)) | _beside(above_horizon, each)
+        apart = np.where(either_above, _apart(distances, each), _apart(values, each))
         alike += (apart < reach) & _beside(there, each)
     return moving & (alike >= _MIN_ALIKE)
 

@@ -75,7 +75,7 @@ def find_first_motion(
         max_concavity=max_concavity,
         max_concave_share=max_concave_share,
     )
-    mask = labels >= 0
+    mask = labels >= 0  # strays belong to no body and stay where they are
     near, seen = replace(near, mask=mask), replace(seen, mask=mask)
     # No more places than there are bodies: what follows costs as much for an empty one.
     numbers = torch.arange(max(1, int(labels.max()) + 1), device=labels.device)
