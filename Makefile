@@ -147,6 +147,7 @@ lint: $(STAMP) ## Check style and docstrings
 
 types: $(STAMP) ## Check the type annotations
 	$(BIN)/mypy
+	$(BIN)/mypy --explicit-package-bases docs/results/studies
 
 imports: $(STAMP) ## Check that imports point one way (contracts in pyproject.toml)
 	$(BIN)/lint-imports

@@ -109,9 +109,7 @@ class Training:
                 num_candidates=24, surface_scale=row.surface_scale, kernel_scales=[0.15, 0.4, 1.0], layer_depth=1.0,
                 near=NEAR, far=FAR, ray_chunk_size=2048, candidate_backend="auto", facing_softness=None,
                 has_scenery=False, num_scenery_candidates=12, elliptic_footprints=True, far_pixels=False,
-                unseen_ground=False,
-                num_lights=0, num_occluders=9,
-        shadow_softness=0.5,
+                seen_through=False, unseen_ground=False, num_lights=0, num_occluders=9, shadow_softness=0.5,
             ),
             location_noise=0.0, checkpoint_dynamics=False, pixel_gradient_to_motion=1.0,
         )  # fmt: skip

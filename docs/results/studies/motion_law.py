@@ -46,7 +46,7 @@ def described(clips: Sequence[float], errors: Sequence[float]) -> dict[str, Any]
     law = fit(clips, errors)
     if law is None:
         return None
-    found = {
+    found: dict[str, Any] = {
         "scale": law[0],
         "exponent": law[1],
         "relative_residual": float(

@@ -91,7 +91,7 @@ def _misplaced(depth: NDArray[np.float32], intrinsics: Array, pose: Array, true:
     return float(np.sqrt((offsets**2).sum(axis=1).mean()))
 
 
-def _refined(seen: Array, intrinsics: Array, given: Array) -> Array:
+def _refined(seen: NDArray[np.floating[Any]], intrinsics: Array, given: Array) -> Array:
     height, width = seen.shape[2:]
     recording = Recording(
         "r", height, width, intrinsics, given, len(seen), len(given), 0.1,
@@ -100,7 +100,7 @@ def _refined(seen: Array, intrinsics: Array, given: Array) -> Array:
     return refine_poses({"r": ImageGeometry(recording, ImportSettings())}, 1).poses["r"]
 
 
-def _nearest(seen: Array, intrinsics: Array, given: Array) -> Array | None:
+def _nearest(seen: NDArray[np.floating[Any]], intrinsics: Array, given: Array) -> Array | None:
     try:
         import small_gicp
     except ImportError:

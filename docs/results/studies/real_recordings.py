@@ -41,6 +41,14 @@ def calibration(source: Path) -> dict[str, Any]:
     return found
 
 
+def read_image(path: Path, flags: int) -> NDArray[Any]:
+    """Return an image file's values, as OpenCV's ``flags`` want them."""
+    image = cv2.imread(str(path), flags)
+    if image is None:
+        raise ValueError(f"{path} is no image that OpenCV reads")
+    return image
+
+
 def write_view(folder: Path, name: str, frames: Sequence[tuple[Path, Path]]) -> None:
     """Write colour and depth (MATLAB's arrays of millimetres, or PNG) as numbered files."""
     for kind in ("rgb", "depth"):
@@ -51,9 +59,8 @@ def write_view(folder: Path, name: str, frames: Sequence[tuple[Path, Path]]) -> 
         if depth.suffix == ".mat":
             cv2.imwrite(str(target), loadmat(depth)["depth_array"])
         else:
-            cv2.imwrite(
-                str(target), np.where((image := cv2.imread(str(depth), -1)) == 65535, 0, image)
-            )  # 7-Scenes: none
+            image = read_image(depth, cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(target), np.where(image == 65535, 0, image))  # 7-Scenes: none
 
 
 def structured_light(source: Path, pictures: str, num_views: int, out: Path) -> None:
@@ -84,13 +91,11 @@ def second_pose(folder: Path, known: dict[str, Any]) -> Array:
     matrix, lens = known["color"]
     shifted = [k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]) for k in (known["depth"][0], matrix)]
     sensor = DepthCamera(480, 640, shifted[0], known["to_color"], known["depth"][1])
-    raw = cv2.imread(str(folder / "camera1" / "depth" / "000000.png"), -1) / np.float32(1000)
+    raw = read_image(folder / "camera1" / "depth" / "000000.png", cv2.IMREAD_UNCHANGED) / np.float32(1000)
     depth = DepthRegistration(sensor, shifted[1], 480, 640)(raw.astype(np.float32))
-    grey = [
-        cv2.imread(str(next((folder / f"camera{n}" / "rgb").glob("000000.*"))), cv2.IMREAD_GRAYSCALE) for n in (1, 2)
-    ]
-    grey = [cv2.undistort(image, matrix, lens) for image in grey]
-    detector = cv2.SIFT_create(6000)
+    paths = [next((folder / f"camera{n}" / "rgb").glob("000000.*")) for n in (1, 2)]
+    grey = [cv2.undistort(read_image(path, cv2.IMREAD_GRAYSCALE), matrix, lens) for path in paths]
+    detector = cv2.SIFT.create(6000)
     (first, one), (second, two) = (detector.detectAndCompute(image, None) for image in grey)
     pairs = [a for a, b in cv2.BFMatcher().knnMatch(one, two, k=2) if a.distance < 0.8 * b.distance]
     pixels = np.array([first[pair.queryIdx].pt for pair in pairs])
@@ -106,7 +111,7 @@ def second_pose(folder: Path, known: dict[str, Any]) -> Array:
     print(f"pose of camera2 from {len(inliers)} features")
     to_second = np.eye(4)
     to_second[:3, :3], to_second[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-    return np.linalg.inv(to_second)
+    return np.linalg.inv(to_second).astype(np.float64)
 
 
 def seven_scenes(source: Path, out: Path) -> None:
