@@ -1,7 +1,7 @@
 """Models trained and evaluated on what depth cameras deliver, beside clean depth.
 
 ``python -m docs.results.studies.noisy_depth OUT.json WORK [--model inertial] [--seeds 0,1] [--conditions NAME,...]
-[--minutes 10]``.
+[--minutes 10] [--section NAME]``.
 For every scene and condition the small data set is generated with a sensor (``WORK/SCENE_CONDITION``), a model is
 trained on it (``MODELS``), and its last checkpoint is evaluated on the test clips of the same data set: it sees their
 noisy depth, and is judged by their true state and their pictures. What is there already is not made again. Percentages
@@ -10,11 +10,13 @@ are of the scene's median depth; cameras are triggered together unless the condi
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from vpd_lightning.files import AtomicPath
@@ -65,6 +67,47 @@ def figures(metrics: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def means(cells: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the mean of the seeds by scene and depth, and the difference to perfect depth with the same seeds.
+
+    ``psnr_moving_gap`` (decibels), ``centroid_error_4_gap`` (centimetres) and ``centroid_error_4_ratio`` compare the
+    means over those seeds which both have. What a cell lacks is left out.
+    """
+    found: dict[str, Any] = {}
+    for key in sorted({key.rpartition("/")[0] for key in cells}, key=_in_order):
+        scene, condition = key.split("/")
+        seeds = {name.rpartition("/")[2]: cell for name, cell in cells.items() if name.rpartition("/")[0] == key}
+        taken = list(seeds.values())
+        mean: dict[str, Any] = {"seeds": len(taken), "updates": round(_mean(taken, "updates"))}
+        mean["psnr_moving"] = _mean(taken, "psnr_moving")
+        mean |= {f"centroid_error_{step}": _mean(taken, "centroid_error", step) for step in ("1", "4", "8", "16")}
+        mine = [cell for seed, cell in seeds.items() if f"{scene}/clean/{seed}" in cells]
+        perfect = [cells[f"{scene}/clean/{seed}"] for seed in seeds if f"{scene}/clean/{seed}" in cells]
+        if perfect and condition != "clean":
+            error, known = _mean(mine, "centroid_error", "4"), _mean(perfect, "centroid_error", "4")
+            mean["paired_seeds"] = len(perfect)
+            mean["psnr_moving_gap"] = _mean(mine, "psnr_moving") - _mean(perfect, "psnr_moving")
+            mean |= {"centroid_error_4_gap": error - known, "centroid_error_4_ratio": error / known}
+        mean |= {name: _mean(taken, "psnr_moving_references", name) for name in ("copy_last", "train_mean")}
+        references = ("best_constant", "constant_velocity", "nothing_moves")
+        mean |= {f"{name}_4": _mean(taken, name, "4") for name in references}
+        found[key] = {name: value for name, value in mean.items() if not math.isnan(value)}
+    return found
+
+
+def _mean(cells: Sequence[Mapping[str, Any]], *path: str) -> float:
+    """Return the mean of what lies there; not a number where a cell has none."""
+    values: list[Any] = list(cells)
+    for name in path:
+        values = [value.get(name) for value in values]
+    return fmean(float("nan") if value is None else value for value in values)
+
+
+def _in_order(key: str) -> tuple[int, int]:
+    scene, condition = key.split("/")
+    return SCENES.index(scene), list(CONDITIONS).index(condition)
+
+
 def measured(model: str, minutes: int, scene: str, condition: str, seed: int, work: Path) -> dict[str, Any]:
     """Generate, train and evaluate, as far as that is not done, and return the figures."""
     data, run = work / f"{scene}_{condition}", work / "runs" / model / f"{scene}_{condition}_seed{seed}"
@@ -84,7 +127,7 @@ def _call(command: str, *words: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure what is missing and write the figures after every model."""
+    """Measure what is missing, and write the figures and their means after every model."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("work", type=Path)
@@ -93,23 +136,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=lambda text: [int(word) for word in text.split(",")], default=[0, 1])
     parser.add_argument("--conditions", type=lambda text: text.split(","), default=list(CONDITIONS)[:3])
     parser.add_argument("--minutes", type=int, help="of a core, for a training (else MINUTES)")
+    parser.add_argument("--section", help="the part of OUT.json that the figures are put into")
     options = parser.parse_args(arguments)
     minutes = options.minutes or MINUTES[options.model]
-    known = json.loads(options.out.read_text()) if options.out.is_file() else {}
-    cells = known.get("cells", {})
     for seed in options.seeds:
         for scene in options.scenes:
             for condition in options.conditions:
                 key = f"{scene}/{condition}/seed{seed}"
-                if key in cells:
+                if key in _cells(options.out, options.section):
                     continue
-                cells[key] = measured(options.model, minutes, scene, condition, seed, options.work)
-                with AtomicPath(options.out) as part:
-                    command = "python -m docs.results.studies.noisy_depth"
-                    result = {"command": command, **known, "cells": dict(sorted(cells.items()))}
-                    part.write_text(json.dumps(result, indent=1) + "\n")
-                print(key, json.dumps(cells[key]), flush=True)
+                cell = measured(options.model, minutes, scene, condition, seed, options.work)
+                # Read anew: another process may have written beside this one.
+                cells = dict(sorted({**_cells(options.out, options.section), key: cell}.items()))
+                whole = json.loads(options.out.read_text()) if options.out.is_file() else {}
+                part = whole.setdefault(options.section, {}) if options.section else whole
+                part.update(cells=cells, means=means(cells))
+                with AtomicPath(options.out) as file:
+                    file.write_text(json.dumps(whole, indent=1) + "\n")
+                print(key, json.dumps(cell), flush=True)
     return 0
+
+
+def _cells(out: Path, section: str | None) -> dict[str, Any]:
+    whole: dict[str, Any] = json.loads(out.read_text()) if out.is_file() else {}
+    cells: dict[str, Any] = (whole.get(section, {}) if section else whole).get("cells", {})
+    return cells
 
 
 if __name__ == "__main__":
