@@ -27,7 +27,9 @@ def write_metrics(path: Path) -> None:
 def test_evaluations_that_are_there_are_read_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(noisy_depth, "_call", lambda *words: pytest.fail("everything is there"))
     for condition in ("clean", "active_stereo_0.5"):
-        write_metrics(tmp_path / "runs" / "inertial" / f"movi_a_{condition}_seed1" / "evaluation" / "metrics.json")
+        write_metrics(
+            tmp_path / "runs" / "inertial_10_minutes" / f"movi_a_{condition}_seed1" / "evaluation" / "metrics.json"
+        )
     out = tmp_path / "found.json"
     words = [str(out), str(tmp_path), "--scenes", "movi_a", "--seeds", "1", "--conditions", "clean,active_stereo_0.5"]
     assert noisy_depth.main(words) == 0
@@ -47,7 +49,9 @@ def test_what_is_missing_is_generated_trained_and_evaluated(tmp_path: Path, monk
     def call(command: str, *words: str) -> None:
         called.append([command, *words])
         if command == "eval":
-            write_metrics(tmp_path / "runs" / "vpd_staged" / "movi_a_poses_5mm_seed0" / "evaluation" / "metrics.json")
+            write_metrics(
+                tmp_path / "runs" / "vpd_staged_20_minutes" / "movi_a_poses_5mm_seed0" / "evaluation" / "metrics.json"
+            )
 
     monkeypatch.setattr(noisy_depth, "_call", call)
     noisy_depth.measured("vpd_staged", 20, "movi_a", "poses_5mm", 0, tmp_path)
