@@ -61,9 +61,9 @@ def write_run(
     if has_particles:
         error = np.full((NUM_TRAJECTORIES, 1, NUM_STEPS), 0.05) * (1 + np.arange(NUM_TRAJECTORIES))[:, None, None] / 6
         arrays |= {"motion/centroid_error": error, "motion/rigidity_error": error / 10, "chamfer/mean": error[:, 0]}
-        motion = {
-            n: summarize(arrays[f"motion/{n}"], trajectory, NUM_BOOTSTRAP) for n in ("centroid_error", "rigidity_error")
-        }
+        arrays["motion/centroid_error_copy"] = error * (1 + np.arange(NUM_STEPS))
+        names = ("centroid_error", "centroid_error_copy", "rigidity_error")
+        motion = {n: summarize(arrays[f"motion/{n}"], trajectory, NUM_BOOTSTRAP) for n in names}
     metrics = {
         "format_version": 1, "model": experiment, "system": system, "experiment": experiment, "seed": seed,
         "checkpoint_sha256": "c" * 64, "step": 500, "data": str(folder / "no_data"), "data_sha256": data_sha256,

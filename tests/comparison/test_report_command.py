@@ -51,6 +51,16 @@ def test_the_report_prints_what_the_evaluations_say(runs: Path):
     assert not list(runs.glob(".report*"))
 
 
+def test_steps_stand_beside_what_needs_no_learning(runs: Path):
+    text = (runs / "report" / "report.md").read_text()
+    table = text[text.index("| centroid error of bodies (cm) after | 1 | 4 |") :].split("\n\n")[0]
+    rows = {row.split(" | ")[0]: [cell.split()[0] for cell in row.split(" | ")[1:]] for row in table.splitlines()}
+    # Errors are 5 cm on the hardest of six trajectories and in proportion on the others; without motion step times it.
+    assert rows["| vpd"] == ["2.9", "2.9"] and rows["| *no motion*"] == ["2.9", "11.7"]
+    assert rows["| vpd less no motion"] == ["+0.0", "-8.7"] or rows["| vpd less no motion"] == ["+0.0", "-8.8"]
+    assert "| *no motion* | - |" in text  # beside the systems, in the column of the centroid error alone
+
+
 def test_the_page_shows_films_first_and_all_that_the_report_says(runs: Path):
     folder = runs / "report"
     page, text = (folder / "index.html").read_text(), (folder / "report.md").read_text()

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vpd_lightning.comparison.comparison_table import ComparisonTable
+from vpd_lightning.comparison.horizons import horizon_tables
 from vpd_lightning.comparison.sweep import Sweep
 from vpd_lightning.comparison.tables import (
     differences_table,
@@ -31,6 +32,7 @@ _READING = """\
 - Budget: what a training was allowed; minutes: what it took, by the named clock; both with its pretraining. Steps:
   updates behind the evaluated weights, without those of a pretraining. Ms per picture: wall time of a clip's
   prediction, from input frames to pictures, over its pictures, on the machine of that evaluation, with what ran there.
+- By predicted step: brackets hold the interval of that step; "less" rows are differences on the same trajectories.
 - `-`: not known, or the system has no such thing."""
 
 
@@ -113,6 +115,9 @@ def _table(table: ComparisonTable, files: TableFiles) -> list[str]:
     best = winners(table)
     if best:
         lines += ["### Who is best", "", *best, ""]
+    by_step = horizon_tables(table)
+    if by_step:
+        lines += ["### By predicted step", "", *by_step]
     paired = differences_table(table)
     if paired:
         words = "Mean differences on the same trajectories, with their intervals; one that holds 0 shows no difference."

@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 
 from vpd_lightning.comparison.bootstrap import sums_of
-from vpd_lightning.metrics.registry import HEADLINE, SOURCES, compared
+from vpd_lightning.metrics.registry import HEADLINE, SOURCES, compared, references_of
 
 KNOWN_FORMATS = (1,)
 _MAX_BYTES = 64 * 2**20
@@ -209,7 +209,8 @@ def _read_samples(path: Path, metrics: Mapping[str, Any]) -> tuple[tuple[str, ..
         with np.load(path, allow_pickle=False) as arrays:
             trajectory, clips = arrays["trajectory"], tuple(str(name) for name in arrays["clip"])
             for source in SOURCES:
-                for info in compared():
+                references = [other for info in compared() for other in references_of(info) if source == "model"]
+                for info in (*compared(), *references):
                     summary = info.summary(metrics, source)
                     name = next((name for name in info.array_names(source) if name in arrays), None)
                     if name is not None and summary is not None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from vpd_lightning.comparison.bootstrap import Estimate
+from vpd_lightning.comparison.bootstrap import Estimate, estimate
 from vpd_lightning.comparison.comparison_table import ComparisonTable, Row, system_order
 from vpd_lightning.comparison.paired_differences import (
     Standing,
@@ -14,7 +14,7 @@ from vpd_lightning.comparison.paired_differences import (
 from vpd_lightning.comparison.run import Run
 from vpd_lightning.comparison.settings import shown
 from vpd_lightning.metrics.metric_info import MetricInfo
-from vpd_lightning.metrics.registry import REFERENCES, compared, paired
+from vpd_lightning.metrics.registry import REFERENCES, compared, paired, references_of
 
 TITLES = {"copy_last": "copy last input frame", "train_mean": "training mean"}
 _WITHIN = " ~"
@@ -44,7 +44,7 @@ def overview(tables: Sequence[ComparisonTable], info: MetricInfo) -> list[str]:
 
 
 def systems_table(table: ComparisonTable) -> list[str]:
-    """One row per system in its main setting, and the two references."""
+    """One row per system in its main setting, and what needs no learning, of images and of motion."""
     infos = _present(table, table.main_rows)
     places = {info.name: standing(table.main_rows, info) for info in infos}
     lines = []
@@ -54,6 +54,13 @@ def systems_table(table: ComparisonTable) -> list[str]:
     for source in REFERENCES:
         cells = [_estimate(info, table.reference(source, info.name)) for info in infos]
         lines.append([f"*{TITLES[source]}*", *cells, *["-"] * len(_COST)])
+    for info in infos:
+        for other in references_of(info):
+            samples = table.reference_samples("model", other.name)
+            found = None if samples is None else estimate(samples, table.runs[0].num_bootstrap)
+            if found is not None:
+                cells = [_estimate(info, found) if one is info else "-" for one in infos]
+                lines.append([f"*{other.title}*", *cells, *["-"] * len(_COST)])
     return markdown(["system", *(info.label for info in infos), *_COST], lines)
 
 
