@@ -26,6 +26,7 @@ SETTINGS = {
     "force_scale": 0.1,
     "residual_share": 0.1,
     "acceleration_gain": 1.0,
+    "force_reach": None,
     "contact_range": 0.5,
     "contact_reach": 5.0,
     "num_contact_iterations": 4,
@@ -379,7 +380,6 @@ def test_a_scene_without_candidates_does_not_move():
     current = replace(current, moving=torch.zeros_like(current.moving))
 
     states = roll(dynamics(), current, current, 3)
-
     assert torch.equal(states[-1].positions, current.positions)
     assert torch.isfinite(states[-1].features).all()
 
@@ -390,8 +390,8 @@ def test_without_observed_normals_it_says_what_to_set():
         dynamics().initialize(current, replace(current, normals=None), RandomKeys.fixed(1))
 
 
-WRONG = [("num_bodies", 0), ("num_probes", 0), ("body_link", 0.0), ("location_scale", -1.0), ("force_scale", 0.0)]
-WRONG += [("rest_share", -0.1), ("shadow_scales", [0.0]), ("edge_reach", 0.0), ("supported_speed", -1.0)]
+WRONG = [(name, 0) for name in ("num_bodies", "num_probes", "body_link", "force_scale", "edge_reach", "force_reach")]
+WRONG += [("location_scale", -1.0), ("rest_share", -0.1), ("shadow_scales", [0.0]), ("supported_speed", -1.0)]
 
 
 @pytest.mark.parametrize(("name", "value"), WRONG)

@@ -294,7 +294,7 @@ def test_gradients_are_finite_with_a_body_that_is_none_beside_it() -> None:
 def test_motion_is_damped_only_where_that_is_wanted(is_damped: bool) -> None:
     forces = BodyForces(
         hidden_dim=8, message_passing_steps=1, num_forces=2, location_scale=0.1, force_scale=0.06, residual_share=0.0,
-        acceleration_gain=1.0, contact_range=0.4, is_damped=is_damped,
+        acceleration_gain=1.0, contact_range=0.4, force_reach=None, is_damped=is_damped,
     ).double()  # fmt: skip
     points, _ = ellipsoid(60, (RADIUS, RADIUS, RADIUS))
     members, centers = torch.ones(1, 1, 60).double(), torch.zeros(1, 1, 3).double()

@@ -51,6 +51,7 @@ ADDED_SETTINGS: dict[str, dict[str, Any]] = {
         "round_contact": False,
         "is_damped": True,
         "skip_resting": False,
+        "force_reach": None,
     },
     f"{_RENDERER}surface.SurfaceRenderer": {"candidate_backend": "auto", **_PLAIN_FEATURES},
     "vpd_lightning.simulator.Simulator": {"pixel_gradient_to_motion": 1.0},

@@ -8,7 +8,11 @@ from torch import Tensor, nn
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, vectors_of
 from vpd_lightning.dynamics.inertial.contact_search import Contacts
+from vpd_lightning.dynamics.inertial.flight import flight
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rotate
+
+_SHARE_IN_CONTACT = 0.03
+"""Of the gradient of the common acceleration: bodies that lie there say less of it than of what carries them."""
 
 
 class BodyForces(nn.Module):
@@ -22,6 +26,9 @@ class BodyForces(nn.Module):
     most ``residual_share`` of ``force_scale`` (metres per step squared), which bounds the common acceleration:
     until that is learned, the other forces must not replace it. ``acceleration_gain`` multiplies the learning rate of
     the common acceleration: an update changes three numbers by less than it does the output of a network.
+    Bodies farther than ``force_reach`` from all that they could touch (``flight``) feel nothing but it, and it is
+    learned from them, nearly alone: else what is wrong with the support of bodies that lie there speaks against
+    gravity, and forces that make up for both act on what falls. Null: all forces act everywhere.
     Damping scales the carried velocity: impacts and friction remove motion in proportion to it. Zero-initialised: no
     force, hardly any damping (0.7 % a step). Without ``is_damped`` motion ends by contact alone: taught by a few steps
     of pixels, damping makes up for what is not known yet, and slows what rolls and falls later on.
@@ -38,10 +45,11 @@ class BodyForces(nn.Module):
         residual_share: float,
         acceleration_gain: float,
         contact_range: float,
+        force_reach: float | None,
         is_damped: bool,
     ):
         super().__init__()
-        self.num_forces, self.contact_range = num_forces, contact_range
+        self.num_forces, self.contact_range, self.force_reach = num_forces, contact_range, force_reach
         self.location_scale, self.force_scale = location_scale, force_scale
         self.residual_scale = residual_share * force_scale
         self.acceleration_gain = acceleration_gain
@@ -96,7 +104,10 @@ class BodyForces(nn.Module):
             pair = [body[:, :, None].expand(-1, -1, count, -1), body[:, None].expand(-1, count, -1, -1)]
             received = (message(torch.cat([*pair, relative, distance], dim=-1)) * pair_weights).sum(dim=2)
             body = body + update(torch.cat([body, received], dim=-1))
-        return self._push(positions, share, probe, body, there, motion, inertia)
+        free = None
+        if self.force_reach is not None:
+            free = flight(positions, contacts.distances, mask, share, motion.centers, self.force_reach)
+        return self._push(positions, share, probe, body, there, free, motion, inertia)
 
     def _pair_weights(
         self, distances: Float[Tensor, "batch body body 1"], there: Float[Tensor, "batch body"]
@@ -146,6 +157,7 @@ class BodyForces(nn.Module):
         probe: Tensor,
         body: Tensor,
         there: Tensor,
+        free: Tensor | None,
         motion: BodyMotion,
         inertia: Inertia,
     ) -> BodyMotion:
@@ -159,13 +171,18 @@ class BodyForces(nn.Module):
         forces = self.residual_scale * torch.tanh(self.force(pair)).unflatten(-1, (self.num_forces, 3))
         push = torch.einsum("bapf,bpfi->bai", attention, forces)
         torque = torch.einsum("bapf,bpfi->bai", attention, cross(offsets[:, :, None].expand_as(forces), forces))
-        weight = self.residual_scale * torch.tanh(self.weight(body)) + self.common_acceleration()
+        weight, common = self.residual_scale * torch.tanh(self.weight(body)), self.common_acceleration()
+        # Nearly one at initialisation; it may remove motion, never add any: a long rollout cannot feed on itself.
+        keep = None if self.damping is None else torch.sigmoid(self.damping(body) + 5.0)
+        if free is not None:
+            near = 1 - free
+            push, torque, weight = push * near, torque * near, weight * near
+            keep = None if keep is None else 1 - (1 - keep) * near
+            common = common.detach() + (common - common.detach()) * free.clamp(min=_SHARE_IN_CONTACT)
         displacements, spins = motion.displacements, motion.spins
-        if self.damping is not None:
-            # Nearly one at initialisation; it may remove motion, never add any: a long rollout cannot feed on itself.
-            keep = torch.sigmoid(self.damping(body) + 5.0)
+        if keep is not None:
             displacements, spins = displacements * keep[..., :1], spins * keep[..., 1:]
-        weight, torque = weight * there[..., None], torque * there[..., None]
+        weight, torque = (weight + common) * there[..., None], torque * there[..., None]
         return replace(
             motion,
             displacements=displacements + push * there[..., None] + weight,

@@ -109,6 +109,7 @@ class InertialDynamics(AbstractDynamics):
         residual_share: float,
         acceleration_gain: float,
         contact_range: float,
+        force_reach: float | None,
         contact_reach: float,
         num_contact_iterations: int,
         num_contact_substeps: int | None,
@@ -138,15 +139,15 @@ class InertialDynamics(AbstractDynamics):
             if count < 1:
                 raise ValueError(f"{name} must be at least 1, got {count}")
         lengths = {"body_link": body_link, "location_scale": location_scale, "force_scale": force_scale}
-        reach = {} if edge_reach is None else {"edge_reach": edge_reach}
-        for name, value in {**lengths, **reach, "acceleration_gain": acceleration_gain}.items():
-            if value <= 0:
+        reaches = {"edge_reach": edge_reach, "force_reach": force_reach, "acceleration_gain": acceleration_gain}
+        for name, value in {**lengths, **reaches}.items():
+            if value is not None and value <= 0:
                 raise ValueError(f"{name} must be positive, got {value}")
         shares = {"rest_share": rest_share, "residual_share": residual_share, "extent_weight": extent_weight}
         for name, value in {**shares, "supported_speed": supported_speed}.items():
             if value < 0:
                 raise ValueError(f"{name} must not be negative, got {value}")
-        self.num_probes = num_probes
+        self.num_probes, self.first_velocity = num_probes, first_velocity
         limits = {"max_concavity": max_concavity, "max_concave_share": max_concave_share}
         self.grouping = {"num_bodies": num_bodies, "body_link": body_link, **limits}
         self.force_scale, self.rest_share = force_scale, rest_share
@@ -154,7 +155,6 @@ class InertialDynamics(AbstractDynamics):
         self.num_contact_iterations, self.num_contact_substeps = num_contact_iterations, num_contact_substeps
         self.mirror_hidden, self.keep_shape, self.carry_memory = mirror_hidden, keep_shape, carry_memory
         self.max_contact_depth, self.extent_weight = max_contact_depth, extent_weight
-        self.first_velocity = first_velocity
         self.log_inertia_ratio = nn.Parameter(torch.zeros(()))
         self.forces = BodyForces(
             hidden_dim=hidden_dim,
@@ -165,6 +165,7 @@ class InertialDynamics(AbstractDynamics):
             residual_share=residual_share,
             acceleration_gain=acceleration_gain,
             contact_range=contact_range,
+            force_reach=force_reach,
             is_damped=is_damped,
         )
         sizes = {"feature_dim": feature_dim, "hidden_dim": hidden_dim}
