@@ -18,6 +18,7 @@ from vpd_lightning.training.checkpoints import find_resume
 from vpd_lightning.training.module import VPDModule
 from vpd_lightning.training.optimization import AbstractOptimization
 
+# force_reach=null: what these recordings show flies, and then no learned force would act and learn.
 MODELS = {
     "paper": ["encoder.num_particles=48"],
     "demo": [
@@ -27,6 +28,7 @@ MODELS = {
         "encoder.background.height=16",
         "encoder.background.width=16",
         "dynamics=inertial",
+        "dynamics.force_reach=null",
         "renderer=splat",
         "data.moving_ray_fraction=0.5",
     ],
@@ -34,6 +36,7 @@ MODELS = {
         "encoder=unet_objects",
         "encoder.num_particles=48",
         "dynamics=inertial",
+        "dynamics.force_reach=null",
         "renderer=splat",
         "loss=pixel_and_motion",
         "data.load_future=true",
