@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator, Sequence
 
-from vpd_lightning.comparison.bootstrap import Estimate, MetricSamples, difference, estimate
+from vpd_lightning.comparison.bootstrap import MetricSamples, difference, estimate
 from vpd_lightning.comparison.comparison_table import ComparisonTable, Row
-from vpd_lightning.comparison.tables import TITLES, markdown
+from vpd_lightning.comparison.tables import TITLES, difference_text, estimate_text, markdown
 from vpd_lightning.metrics.metric_info import MetricInfo
 from vpd_lightning.metrics.registry import REFERENCES, referenced, references_of, scores
 
@@ -59,7 +59,7 @@ def _references(table: ComparisonTable, info: MetricInfo) -> Iterator[tuple[str,
 
 def _cells(info: MetricInfo, samples: MetricSamples, steps: Sequence[int], num_bootstrap: int) -> list[str]:
     parts = [_step(samples, step) for step in steps if step <= samples.total.shape[2]]
-    cells = [_text(info, estimate(part, num_bootstrap), "") for part in parts]
+    cells = [estimate_text(info, estimate(part, num_bootstrap)) for part in parts]
     return [*cells, *["-"] * (len(steps) - len(cells))]
 
 
@@ -69,15 +69,8 @@ def _differences(
     if reference.total.shape[1:] != own.total.shape[1:]:
         return ["-"] * len(steps)
     found = [difference(_step(own, step), _step(reference, step), num_bootstrap) for step in steps]
-    return [_text(info, None if one is None else one[0], "+") for one in found]
+    return ["-" if one is None else difference_text(info, one[0]) for one in found]
 
 
 def _step(samples: MetricSamples, step: int) -> MetricSamples:
     return MetricSamples(samples.total[..., step - 1 : step], samples.count[..., step - 1 : step])
-
-
-def _text(info: MetricInfo, found: Estimate | None, sign: str) -> str:
-    if found is None:
-        return "-"
-    mean, *ends = (f"{info.scale * value:{sign}.{info.digits}f}" for value in (found.mean, *(found.interval or ())))
-    return f"{mean} [{', '.join(ends)}]" if ends else mean

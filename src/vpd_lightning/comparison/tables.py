@@ -39,7 +39,7 @@ def overview(tables: Sequence[ComparisonTable], info: MetricInfo) -> list[str]:
         lines.append([system, *cells])
     for source in REFERENCES:
         found = [table.reference(source, info.name) for table in tables]
-        lines.append([f"*{TITLES[source]}*", *(_estimate(info, one) for one in found)])
+        lines.append([f"*{TITLES[source]}*", *(estimate_text(info, one) for one in found)])
     return markdown([info.label, *(table.title for table in tables)], lines)
 
 
@@ -52,14 +52,14 @@ def systems_table(table: ComparisonTable) -> list[str]:
         cells = [_cell(info, row.estimate(info.name), row, places[info.name]) for info in infos]
         lines.append([row.system, *cells, *_cost(row)])
     for source in REFERENCES:
-        cells = [_estimate(info, table.reference(source, info.name)) for info in infos]
+        cells = [estimate_text(info, table.reference(source, info.name)) for info in infos]
         lines.append([f"*{TITLES[source]}*", *cells, *["-"] * len(_COST)])
     for info in infos:
         for other in references_of(info):
             samples = table.reference_samples("model", other.name)
             found = None if samples is None else estimate(samples, table.runs[0].num_bootstrap)
             if found is not None:
-                cells = [_estimate(info, found) if one is info else "-" for one in infos]
+                cells = [estimate_text(info, found) if one is info else "-" for one in infos]
                 lines.append([f"*{other.title}*", *cells, *["-"] * len(_COST)])
     return markdown(["system", *(info.label for info in infos), *_COST], lines)
 
@@ -68,7 +68,7 @@ def settings_table(table: ComparisonTable) -> list[str]:
     """Every setting of the systems that were trained in more than one; nothing is marked as best here."""
     rows = [row for row in table.rows if sum(other.system == row.system for other in table.rows) > 1]
     infos = _present(table, rows)
-    lines = [[row.name, *(_estimate(info, row.estimate(info.name)) for info in infos), *_cost(row)] for row in rows]
+    lines = [[row.name, *(estimate_text(info, row.estimate(info.name)) for info in infos), *_cost(row)] for row in rows]
     return markdown(["system and setting", *(info.label for info in infos), *_COST], lines) if rows else []
 
 
@@ -122,7 +122,7 @@ def differences_table(table: ComparisonTable) -> list[str]:
     pairs = [pair for pair in paired_differences(table) if pair[2]]
     infos = [info for info in paired() if any(info.name in found for _, _, found in pairs)]
     for first, second, found in pairs:
-        cells = [_difference(info, found[info.name][0]) if info.name in found else "-" for info in infos]
+        cells = [difference_text(info, found[info.name][0]) if info.name in found else "-" for info in infos]
         counts = sorted({number for _, number in found.values()})
         second = f"*{TITLES[second]}*" if second in TITLES else second
         lines.append(
@@ -166,7 +166,7 @@ def _count(run: Run) -> str:
 
 def _cell(info: MetricInfo, found: Estimate | None, row: Row, place: Standing | None) -> str:
     """Bold: best, and alone; a tilde: the best or within its interval."""
-    text = _estimate(info, found)
+    text = estimate_text(info, found)
     if place is None or found is None:
         return text
     if row is place.best and not place.within:
@@ -175,7 +175,8 @@ def _cell(info: MetricInfo, found: Estimate | None, row: Row, place: Standing | 
     return text + (_WITHIN if row is place.best or row in place.within else "")
 
 
-def _estimate(info: MetricInfo, found: Estimate | None) -> str:
+def estimate_text(info: MetricInfo, found: Estimate | None) -> str:
+    """A mean as the metric is printed, with its interval in brackets; a dash where there is none."""
     if found is None:
         return "-"
     if found.interval is None:
@@ -183,7 +184,8 @@ def _estimate(info: MetricInfo, found: Estimate | None) -> str:
     return f"{info.shown(found.mean)} [{info.shown(found.interval[0])}, {info.shown(found.interval[1])}]"
 
 
-def _difference(info: MetricInfo, found: Estimate) -> str:
+def difference_text(info: MetricInfo, found: Estimate) -> str:
+    """The same of a difference, with its sign."""
     values = [found.mean, *(found.interval or ())]
     mean, *ends = [f"{info.scale * value:+.{info.digits}f}" for value in values]
     return f"{mean} [{', '.join(ends)}]" if ends else mean
