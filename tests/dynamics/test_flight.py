@@ -1,5 +1,7 @@
 """What flies feels the common acceleration alone, and teaches it. Metres and steps."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -8,27 +10,28 @@ from tests.dynamics.contact_world import floor_contacts
 from tests.dynamics.solids import ball
 from vpd_lightning.dynamics.inertial.body_forces import BodyForces
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, body_inertia
+from vpd_lightning.dynamics.inertial.contact_search import ContactPoints
 from vpd_lightning.dynamics.inertial.flight import flight
 
 RADIUS, REACH = 0.1, 0.8
 GRAVITY = 0.016
 
 
-def balls(*centers: tuple[float, float, float], count: int = 40) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions of all balls' points (1 point 3), whose they are (1 ball point), and centres (1 ball 3)."""
+def balls(*centers: tuple[float, float, float], count: int = 40) -> tuple[ContactPoints, Tensor]:
+    """Points on all balls, and the centres (1 ball 3)."""
     surface = ball(count, 0, RADIUS)[0].double()
     surface = RADIUS * surface / surface.norm(dim=-1, keepdim=True)
     middles = torch.tensor(centers, dtype=torch.float64)
     whose = torch.arange(len(centers)).repeat_interleave(count)
     members = (whose == torch.arange(len(centers))[:, None]).double()
-    return (middles[whose] + surface.repeat(len(centers), 1))[None], members[None], middles[None]
+    normals = surface.repeat(len(centers), 1) / RADIUS
+    return ContactPoints((middles[whose] + RADIUS * normals)[None], normals[None], members[None]), middles[None]
 
 
 def in_flight(*centers: tuple[float, float, float], scale: float = 1.0) -> list[float]:
-    positions, members, middles = (scale * part for part in balls(*centers))
-    members = members / members.sum(dim=-1, keepdim=True)
-    mask = torch.ones(positions.shape[:2], dtype=torch.bool)
-    found: list[float] = flight(positions, positions[..., 2], mask, members, middles, REACH)[0, :, 0].tolist()
+    points, middles = balls(*centers)
+    points = replace(points, positions=scale * points.positions)
+    found: list[float] = flight(points, points.positions[..., 2], scale * middles, REACH)[0, :, 0].tolist()
     return found
 
 
@@ -47,7 +50,8 @@ def made_forces(force_reach: float | None) -> BodyForces:
 
 
 def after(forces: BodyForces, *centers: tuple[float, float, float], speed: float = 0.01) -> BodyMotion:
-    positions, members, middles = balls(*centers)
+    points, middles = balls(*centers)
+    positions, members = points.positions, points.members
     count = len(centers)
     velocity = torch.full((1, count, 3), speed, dtype=torch.float64)
     strains = torch.zeros(1, count, 3, 3, dtype=torch.float64)
@@ -56,7 +60,7 @@ def after(forces: BodyForces, *centers: tuple[float, float, float], speed: float
     inertia = body_inertia(positions, middles, shares, torch.zeros(1, count, 1).double(), torch.ones(()).double())
     mask = torch.ones(positions.shape[:2], dtype=torch.bool)
     moved = torch.full_like(positions, speed)
-    return forces(positions, moved, floor_contacts(positions), mask, members, motion, inertia)
+    return forces(moved, mask, points, floor_contacts(positions), motion, inertia)
 
 
 def test_a_body_flies_where_it_is_far_from_all_that_it_could_touch():
@@ -71,11 +75,22 @@ def test_a_body_flies_where_it_is_far_from_all_that_it_could_touch():
 
 
 def test_places_without_a_body_do_not_fly_and_are_near_nobody():
-    positions, members, middles = balls((0, 0, 1.0))
-    members = torch.cat([members / members.sum(dim=-1, keepdim=True), torch.zeros_like(members)], dim=1)
+    points, middles = balls((0, 0, 1.0))
+    points = replace(points, members=torch.cat([points.members, torch.zeros_like(points.members)], dim=1))
     middles = torch.cat([middles, middles], dim=1)
-    mask = torch.ones(positions.shape[:2], dtype=torch.bool)
-    assert flight(positions, positions[..., 2], mask, members, middles, REACH)[0, :, 0].tolist() == [1.0, 0.0]
+    assert flight(points, points.positions[..., 2], middles, REACH)[0, :, 0].tolist() == [1.0, 0.0]
+
+
+def test_what_is_guessed_of_a_hidden_side_counts():
+    """A ball of which the upper half is seen; its image reaches the floor."""
+    points, middles = balls((0, 0, RADIUS))
+    seen = points.positions[0, :, 2] > RADIUS
+    places, normals, members = points.positions[:, seen], points.normals[:, seen], points.members[..., seen]
+    upper = ContactPoints(places, normals, members)
+    assert flight(upper, places[..., 2], middles, REACH).item() > 0.5
+    places = torch.cat([places, 2 * middles - places], dim=1)
+    whole = ContactPoints(places, torch.cat([normals, -normals], dim=1), torch.cat([members, members], dim=2))
+    assert flight(whole, whole.positions[..., 2], middles, REACH).item() == 0.0
 
 
 def test_learned_forces_and_damping_act_near_something_alone():

@@ -304,7 +304,8 @@ def test_motion_is_damped_only_where_that_is_wanted(is_damped: bool) -> None:
     )
     inertia = body_inertia(points[None], centers, members / 60, torch.zeros(1, 1, 1).double(), torch.ones(()).double())
     mask = torch.ones(1, 60) > 0
-    made = forces(points[None], torch.zeros(1, 60, 3).double(), nothing_near, mask, members, spinning, inertia)
+    touching = ContactPoints(points[None], torch.zeros(1, 60, 3).double(), members)
+    made = forces(torch.zeros(1, 60, 3).double(), mask, touching, nothing_near, spinning, inertia)
     share = torch.sigmoid(torch.tensor(5.0)).item() if is_damped else 1.0
     assert torch.allclose(made.spins, share * spinning.spins, atol=1e-6)
     assert torch.allclose(made.displacements, share * spinning.displacements, atol=1e-6)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vpd_lightning.dynamics.inertial.body_motion import BodyMotion, Inertia, vectors_of
-from vpd_lightning.dynamics.inertial.contact_search import Contacts
+from vpd_lightning.dynamics.inertial.contact_search import ContactPoints, Contacts
 from vpd_lightning.dynamics.inertial.flight import flight
 from vpd_lightning.dynamics.inertial.rigid_motion import cross, rotate
 
@@ -77,15 +77,20 @@ class BodyForces(nn.Module):
 
     def forward(
         self,
-        positions: Float[Tensor, "batch probe 3"],
         displacements: Float[Tensor, "batch probe 3"],
-        contacts: Contacts,
         mask: Bool[Tensor, "batch probe"],
-        weights: Float[Tensor, "batch body probe"],
+        points: ContactPoints,
+        contacts: Contacts,
         motion: BodyMotion,
         inertia: Inertia,
     ) -> BodyMotion:
-        """Return the corrected motion. Lengths are metres per step; weights are 1 where a probe belongs to a body."""
+        """Return the corrected motion. Lengths are metres per step.
+
+        ``points`` are all that may touch something, the probes first, and ``contacts`` is what is near them.
+        """
+        count = displacements.shape[1]
+        positions, weights = points.positions[:, :count], points.members[..., :count]
+        of_points, contacts = contacts, contacts.first(count)
         probe = self.encode_probe(self._probe_inputs(displacements, contacts)) * mask[..., None]
         share = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-12)
         mean = torch.einsum("bap,bph->bah", share, probe)
@@ -97,16 +102,16 @@ class BodyForces(nn.Module):
         body = self.encode_body(body)
         relative = (motion.centers[:, :, None] - motion.centers[:, None]) / self.contact_range
         distance = relative.square().sum(dim=-1, keepdim=True).clamp(min=1e-12).sqrt()
-        count = body.shape[1]
+        num_bodies = body.shape[1]
         there = (weights.sum(dim=-1) > 0).to(body.dtype)
         pair_weights = self._pair_weights(distance, there)
         for message, update in zip(self.messages, self.updates, strict=True):
-            pair = [body[:, :, None].expand(-1, -1, count, -1), body[:, None].expand(-1, count, -1, -1)]
+            pair = [body[:, :, None].expand(-1, -1, num_bodies, -1), body[:, None].expand(-1, num_bodies, -1, -1)]
             received = (message(torch.cat([*pair, relative, distance], dim=-1)) * pair_weights).sum(dim=2)
             body = body + update(torch.cat([body, received], dim=-1))
         free = None
         if self.force_reach is not None:
-            free = flight(positions, contacts.distances, mask, share, motion.centers, self.force_reach)
+            free = flight(points, of_points.distances, motion.centers, self.force_reach)
         return self._push(positions, share, probe, body, there, free, motion, inertia)
 
     def _pair_weights(

@@ -359,11 +359,10 @@ class InertialDynamics(AbstractDynamics):
         points = with_feet(points, memory.shapes, memory.motion, joined, surface.edges, surface.clearances, far)
         contacts = static_contacts(surface, points, statics, centers, far)
         motion = self.forces(
-            probe_positions,
             moved * memory.mask[:, probes, None],
-            contacts.first(probe_positions.shape[1]),
             memory.mask[:, probes],
-            members,
+            points,
+            contacts,
             memory.motion,
             inertia,
         )
