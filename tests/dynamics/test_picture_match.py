@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from tests.dynamics.test_first_velocity import first_velocity, one_body, surfels
 from tests.dynamics.test_inertial import dynamics
@@ -53,7 +54,8 @@ def random_frames(seed, count=40):
 
 
 def plain_picture(rgb):
-    return np.concatenate([rgb / (rgb.sum(-1, keepdims=True) + 0.15), 0.3 * rgb], axis=-1)
+    compared = np.concatenate([rgb / (rgb.sum(-1, keepdims=True) + 0.15), 0.3 * rgb], axis=-1)
+    return gaussian_filter(compared, 0.8, radius=2, mode="nearest", axes=(0, 1))
 
 
 def plain_value(image, x, y):

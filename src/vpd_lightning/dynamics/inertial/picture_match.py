@@ -16,6 +16,10 @@ _OTHER = 0.15
 _BEHIND = 2.0
 """Spacings of the particles by which one may lie off the depth of a picture's pixel and still be what it shows."""
 
+_SMOOTHING = 0.8
+"""Standard deviation in pixels by which pictures are smoothed before they are compared. Sampled between its pixels a
+picture is smoother than at them; at outlines, of which only the inside belongs to the body, that looks like motion."""
+
 
 def chromaticity(colors: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 6"]:
     """Return what is compared of colours: shares of red, green and blue, and, more weakly, brightness."""
@@ -93,12 +97,22 @@ def picture_match(
 
 
 def _with_slopes(rgb: Float[Tensor, "batch view height width 3"]) -> Float[Tensor, "batch view plane height width"]:
-    """Return the channels that are compared, and behind them their central differences across and down."""
+    """Return the channels that are compared, smoothed, and behind them their central differences across and down."""
     images = chromaticity(rgb).movedim(-1, 2)
+    images = _smoothed(images.flatten(0, 1)).view_as(images)
     padded = functional.pad(images.flatten(0, 1), (1, 1, 1, 1), mode="replicate")
     across = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
     down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
     return torch.cat([images, across.view_as(images), down.view_as(images)], dim=2)
+
+
+def _smoothed(images: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image channel height width"]:
+    """Return the images after a Gaussian filter; beyond their borders they go on as at them."""
+    reach, channels = 2, images.shape[1]
+    taps = torch.exp(-(torch.arange(-reach, reach + 1).to(images) / _SMOOTHING).square() / 2)
+    across = (taps / taps.sum()).expand(channels, 1, 1, -1)
+    padded = functional.pad(images, (reach, reach, reach, reach), mode="replicate")
+    return functional.conv2d(functional.conv2d(padded, across, groups=channels), across.mT, groups=channels)
 
 
 def _projected(
