@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_gen.settings import load_preset, preset_names, scene_names
 from tests.data_gen.blocks import contents, generate_small
 from tests.training.tiny_training import tiny_data
 from vpd_lightning.data.clip import read_clip
@@ -207,6 +208,17 @@ def test_what_cannot_be_triggered_late_is_said(tmp_path, clean):
         generate_small(tmp_path / "x", sensor="active_stereo", **{"sensor.trigger_offset": 5.0})
     with pytest.raises(ConfigError, match=r"add sensor=NAME"):
         generate_small(tmp_path / "x", **{"sensor.trigger_offset": 0.01})
+
+
+def test_cameras_of_every_scene_can_be_triggered_late_as_shipped():
+    presets = [(scene, preset) for scene in scene_names() for preset in preset_names(scene)]
+    assert len(presets) >= 30
+    for scene, preset in presets:
+        _, settings = load_preset(scene, preset)
+        substeps = round(settings.frame_time / settings.timestep)
+        for name in sensor_names():
+            sensor = load_sensor(name, {})
+            assert sensor is None or substeps % sensor.trigger_steps == 0, (scene, preset, name)
 
 
 def test_training_clips_get_the_errors_and_validation_clips_do_not(clean):
