@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from vpd_lightning.metrics.registry import metric
+from vpd_lightning.release.model_card import num_processes
 
 STEPS = tuple(f"step {step}" for step in (1, 4, 8, 16, 32))
 FORMS = {
@@ -191,7 +193,12 @@ def releases(content: None, path: Path) -> str:
     for metrics in sorted(found, key=lambda item: (item["experiment"] != "demo", -item["psnr_moving"]["mean"])):
         folder, training, experiment = metrics["folder"], metrics["training"], metrics["experiment"]
         minutes = training["minutes_allowed"]
-        length = f"{minutes} minutes of one core" if minutes else f"{training['steps']:,} updates"
+        config = yaml.safe_load((path / folder / "config.yaml").read_text())
+        num_cores = num_processes(config)
+        cores = "one core" if num_cores == 1 else f"each of {num_cores} cores"
+        length = f"{minutes} minutes of {cores}" if minutes else f"{training['steps']:,} updates"
+        before = (config.get("pretraining") or {}).get("ckpt")
+        length += f", on from {Path(before).name}" if before else ""
         cells = [
             f"[{folder}](released/{folder})",
             f"{SCENES[experiment]}, {metrics['protocol']['num_steps']} steps",

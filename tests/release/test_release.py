@@ -15,10 +15,11 @@ from torch import nn
 
 import vpd_lightning
 from tests.released_model import cameras, figures, predict, synthetic_frames, write_run, write_slotformer
+from vpd_lightning.data.trained_on import TRAINED_ON
 from vpd_lightning.errors import CheckpointError, ConfigError
 from vpd_lightning.loading import LoadedModel, load_model
 from vpd_lightning.release.card_figures import beaten_by, beaten_in_motion_by, figure_lines
-from vpd_lightning.release.model_card import protocol_words
+from vpd_lightning.release.model_card import CardContent, model_card, protocol_words
 from vpd_lightning.release.portable import absolute_paths, portable_config, portable_data_folder
 from vpd_lightning.release.release import TrainedSystem, find_metrics, float32_weights, write_release
 from vpd_lightning.release.release_folder import check_release, list_releases, sha256
@@ -26,6 +27,7 @@ from vpd_lightning.release.results_folder import beside_checkpoint
 from vpd_lightning.types import RGBDFrames
 
 FILES = ["README.md", "config.yaml", "metrics.json", "model.safetensors", "release.json"]
+BOXES = {"scene": "boxes", "preset": "small", "seed": 0}
 
 
 @pytest.fixture(scope="module")
@@ -223,6 +225,20 @@ def test_the_card_admits_what_it_does_not_know(trained: TrainedSystem, original:
     table = "\n".join(figure_lines(metrics))
     assert "Chamfer" not in table and "None" not in table
     assert "| PSNR (dB), other cameras | 20.00 |  | 20.00 |" in table
+
+
+def test_the_card_says_what_it_was_trained_on_from(original: Path) -> None:
+    config, metrics = load_model(original).config, json.loads((original / "metrics.json").read_text())
+    index = {**json.loads((original / "release.json").read_text()), TRAINED_ON: ["a", "b", "c"]}
+    content = CardContent("boxes", index, {**config, "generate": BOXES}, metrics, None, {}, megabytes=1.0)
+    begun = {"pretraining": {"ckpt": "released/before"}, "trainer": {"devices": 2, "strategy": "ddp"}}
+
+    assert "splits.train=3" in model_card(content) and "begun from" not in model_card(content)
+    training = {"seconds": 60.0, "clock": "cpu"}
+    card = model_card(replace(content, config={**content.config, **begun}, training=training))
+    assert "- begun from the weights of `released/before`" in card and "splits.train=" not in card
+    assert "the weights of `released/before`: the two trainings saw 3 trajectories in all" in card
+    assert "1.0 minutes on the processor clock of each of 2 processes" in card
 
 
 def test_the_card_says_how_to_get_its_figures_again(original: Path) -> None:

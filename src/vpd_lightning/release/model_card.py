@@ -105,8 +105,10 @@ def _data_lines(config: Mapping[str, Any], metrics: Mapping[str, Any], trained_o
     folder, wanted = config["data"]["folder"], config.get("generate")
     digest = metrics.get("data_sha256")
     lines = []
-    # The folder may hold another number than the preset says; how many there were is known where all were trained on.
-    is_known = trained_on is not None and config["data"].get("num_trajectories") is None
+    # The folder may hold another number than the preset says; how many there were is known where all were trained on,
+    # and nothing else was.
+    before = _trained_before(config)
+    is_known = trained_on is not None and config["data"].get("num_trajectories") is None and not before
     size = f" splits.train={len(trained_on or ())}" if is_known else ""
     if wanted and wanted.get("scene"):
         lines += [
@@ -123,6 +125,12 @@ def _data_lines(config: Mapping[str, Any], metrics: Mapping[str, Any], trained_o
     count = config["data"].get("num_trajectories")
     if count is not None:
         lines += ["", f"Trained on {count} of its training trajectories."]
+    if before and trained_on is not None:
+        lines += [
+            "",
+            f"It began with the weights of `{before}`: the two trainings saw {len(trained_on)} trajectories in all. "
+            "How many of them are of this data set is not known here; `splits.train` says how many are generated.",
+        ]
     if digest:
         lines += ["", f"The figures are of the data set with the SHA-256 `{digest}`."]
     return lines
@@ -131,15 +139,18 @@ def _data_lines(config: Mapping[str, Any], metrics: Mapping[str, Any], trained_o
 def _training_lines(content: CardContent) -> list[str]:
     config, training = content.config, content.training
     lines = [f"- updates: {content.index['step']:,}"]
+    if _trained_before(config):
+        lines.append(f"- begun from the weights of `{_trained_before(config)}`")
+    each = f" of each of {num_processes(config)} processes" if num_processes(config) > 1 else ""
     budget = (config.get("callbacks") or {}).get("time_budget")
     limit = (config.get("trainer") or {}).get("max_steps")
     if isinstance(budget, Mapping) and budget.get("minutes") is not None:
-        lines.append(f"- budget: {budget['minutes']:g} minutes on the {_clock(budget['clock'])} clock")
+        lines.append(f"- budget: {budget['minutes']:g} minutes on the {_clock(budget['clock'])} clock{each}")
     elif limit:
         lines.append(f"- budget: {limit:,} updates")
     if training:
         seconds = float(training["seconds"])
-        lines.append(f"- time used: {seconds / 60:.1f} minutes on the {_clock(training['clock'])} clock")
+        lines.append(f"- time used: {seconds / 60:.1f} minutes on the {_clock(training['clock'])} clock{each}")
         first = (training.get("pretraining") or {}).get("seconds", training.get("seconds_before"))
         if first:
             lines.append(f"- of these, the first training and what it prepared: {float(first) / 60:.1f} minutes")
@@ -156,6 +167,20 @@ def _training_lines(content: CardContent) -> list[str]:
     if content.environment.get("git_commit"):
         lines.append(f"- source: commit `{content.environment['git_commit']}`")
     return [*lines, "", "`config.yaml` holds every setting."]
+
+
+def num_processes(config: Mapping[str, Any]) -> int:
+    """Return how many processes a training ran in, by its configuration; 1 where that depends on the machine."""
+    trainer = config.get("trainer") or {}
+    devices, nodes = trainer.get("devices", 1), trainer.get("num_nodes", 1)
+    is_known = str(trainer.get("strategy", "")).startswith("ddp") and isinstance(devices, int)
+    return max(1, devices) * int(nodes) if is_known else 1
+
+
+def _trained_before(config: Mapping[str, Any]) -> str | None:
+    """Return the weights that the training began with, where it had any."""
+    found = (config.get("pretraining") or {}).get("ckpt")
+    return str(found) if found else None
 
 
 def _clock(name: str) -> str:
